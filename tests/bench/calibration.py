@@ -3,7 +3,7 @@
 The truth is the tests' own generator (tests/compensation/calibration_truth.py): 34 positions, 54 markers, 3 mpx of
 detection noise, a print that is 20 um off and measured to 1 um, a table of 0.5 um and 0.1 arcmin. Both get the
 measured board. Translations are those of the target's centre from V0 to V1..V3, in the frame of the table's axes:
-the peer's frame is given by its own poses of the calibration positions, so each is told its axes by what it found.
+the peer's frame is given by its own poses of the calibration positions, so each gets its axes from what it found.
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ def _figure(name: str, scene: Scene, clean: Float, picture: Picture) -> Figure:
     found = [detect(picture(scene, clean, FIRST_SEED + number), target) for number in range(FRAMES)]
     chi2 = _chi2(found, true_centres_px(scene))
     doubtful = sum(detection.is_doubtful for detection in found)
-    told = f" ({doubtful} of {FRAMES} frames doubtful)" if doubtful else ""
-    figure = absolute(f"claimed variances, {name}{told}", "chi^2", [max(*chi2, *(1 / chi2))])
+    reported = f" ({doubtful} of {FRAMES} frames doubtful)" if doubtful else ""
+    figure = absolute(f"claimed variances, {name}{reported}", "chi^2", [max(*chi2, *(1 / chi2))])
     return figure if doubtful > FRAMES / 2 else at_most(GOAL, figure)
 
 

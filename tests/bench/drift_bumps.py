@@ -22,7 +22,7 @@ _FIRST_SEED = 500  # the least gain of a bump was chosen on nights from 1000 on
 
 
 def figures() -> Iterator[Figure]:
-    """Nights without slips and fixings that settle anew, which are steps themselves; those have a line of their own."""
+    """Nights without slips and fixings that settle again, which are steps themselves and have a line of their own."""
     progress(f"drift, {CLEAN_NIGHTS} nights without a bump")
     nights = (drawn_night(_FIRST_SEED + seed, unrepeating=False) for seed in range(CLEAN_NIGHTS))
     false = sum(bool(find_bumps(made.observed)) for made in nights)

@@ -1,5 +1,5 @@
 """Drawn cameras with few set-points: which form is chosen, and what each leaves at others on another night. And two
-nights fitted together, asked about a third, beside fixings that settle anew."""
+nights fitted together, asked about a third, beside fixings that settle again."""
 
 from __future__ import annotations
 
@@ -55,5 +55,5 @@ def _several() -> Figure:
         nights = [night(camera, full_night(), 10 * seed + k, session_id=f"night-{k}") for k in range(3)]
         model = fit_thermal(concatenate([one.observed for one in nights[:2]]))
         covered.append(100 * score(model, nights[2], Role.VALIDATION).covered)
-    what = "drift, 95 % interval of two nights in a third, fixings settle anew"
+    what = "drift, 95 % interval of two nights in a third, fixings settle again"
     return at_least(LEAST_COVERED, absolute(what, "%", [float(np.mean(covered))]))

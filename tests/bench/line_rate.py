@@ -1,7 +1,7 @@
 """The whole recorder at the line rate of GigE: 5 MP raw frames, 118 MB/s, a minute, each on the disk before it counts.
 
 Hub, queue, thread, encoder and sink as in a run, on the host's clock, in a process of its own, whose peak memory is
-told. Each frame is an array of its own, as a camera gives it, published at absolute deadlines. Then, in turns, as fast
+it. Each frame is an array of its own, as a camera gives it, published at absolute deadlines. Then, in turns, as fast
 as it goes against a bare loop of pwrite and fdatasync with the same bytes. The minute takes 7.1 GB of the disk.
 """
 

@@ -2,7 +2,7 @@
 
 A night of 24 h, all that is polled, is published as fast as it goes while the page is open at 24 h of curves. Then two
 viewers follow a stand that takes two frames a second; what they cost is the daemon's processor time with them less that
-without. Markers are looked for by another process, whose time is told apart.
+without. Markers are looked for by another process, whose time is given apart.
 """
 
 from __future__ import annotations
@@ -70,13 +70,14 @@ async def _lived_through(desk: NightDesk, chromium: Any, port: int) -> list[Figu
     with waiting() as waited_ms:
         answers_ms = await asyncio.to_thread(_answers_ms, port, desk)
     peer = f"{before_MB:.1f} MB at first, {seen_MB[-1]:.1f} MB at the end"
-    told = f"p99 of {ASKED}; median {statistics.median(answers_ms):.1f} ms"
+    reported = f"p99 of {ASKED}; median {statistics.median(answers_ms):.1f} ms"
     return [
         at_most(100, Figure("page open for 24 h of a night, heap in use at most", "MB", max(seen_MB), peer)),
         at_most(
             50,
             beside(
-                Figure("curves of 24 h in 1200 columns, 12 channels, answered", "ms", p99(answers_ms), told), waited_ms
+                Figure("curves of 24 h in 1200 columns, 12 channels, answered", "ms", p99(answers_ms), reported),
+                waited_ms,
             ),
         ),
     ]

@@ -1,5 +1,5 @@
 """A method of one's own, as `make benchmark METHOD=tests/benchmark/example_method.py` takes it: an affine motion of the
-image for each temperature the camera has told, and a straight line between them. NAME and `fit` are all there is to it.
+image for each temperature the camera has shown, and a straight line between them. NAME and `fit` are all there is.
 """
 
 from __future__ import annotations

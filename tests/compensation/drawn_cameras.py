@@ -133,8 +133,10 @@ def drawn_unit(seed: int, number: int, *effects: str) -> Camera:
     for field in fields(middle):
         value = getattr(middle, field.name)
         if field.name not in (*changed, "effects", "air_share"):
-            told = np.asarray(value) * (1 + UNIT_SCATTER * rng.standard_normal(np.shape(value)))
-            changed[field.name] = told if isinstance(value, np.ndarray) else tuple(told) if told.ndim else float(told)
+            stated = np.asarray(value) * (1 + UNIT_SCATTER * rng.standard_normal(np.shape(value)))
+            changed[field.name] = (
+                stated if isinstance(value, np.ndarray) else tuple(stated) if stated.ndim else float(stated)
+            )
     return replace(middle, **changed)
 
 
@@ -274,15 +276,15 @@ def centres_px(camera: Camera, nodes: Float, moved: Float, place_mm: Float | Non
 def sensor_degC(camera: Camera, nodes: Float, powered: Float) -> Float:
     """(K,): what the camera tells of its own temperature, NaN while it is off."""
     chip = nodes[:, CHIP]
-    told = np.round(chip / 0.1) * 0.1
+    stated = np.round(chip / 0.1) * 0.1
     if camera.effects.coarse_sensor:
-        told = np.round((lagged(chip, camera.sensor_lag_s) + camera.sensor_offset_K) / 0.5) * 0.5
-    return np.where(powered > 0, told, np.nan)
+        stated = np.round((lagged(chip, camera.sensor_lag_s) + camera.sensor_offset_K) / 0.5) * 0.5
+    return np.where(powered > 0, stated, np.nan)
 
 
 def air_near_degC(camera: Camera, air_degC: Float, rng: np.random.Generator) -> Float:
     """(K,): what the stand's thermometer tells of the air."""
-    told = air_degC
+    stated = air_degC
     if camera.effects.far_air:
-        told = REFERENCE_DEGC + camera.air_share * (lagged(air_degC, camera.air_lag_s) - REFERENCE_DEGC)
-    return told + 0.003 * rng.standard_normal(len(air_degC))
+        stated = REFERENCE_DEGC + camera.air_share * (lagged(air_degC, camera.air_lag_s) - REFERENCE_DEGC)
+    return stated + 0.003 * rng.standard_normal(len(air_degC))

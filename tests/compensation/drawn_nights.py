@@ -136,8 +136,8 @@ def night(
     seen = truth + noise_px * rng.standard_normal(truth.shape)
     for bump in bumps:
         seen[at_s >= 3600 * bump.after_h] += bump.shift_px
-    told, near = sensor_degC(camera, nodes, powered), air_near_degC(camera, air, rng)
-    return Night(_observations(plan, session_id, grid_s, seen, told, near, noise_px, before), truth)
+    stated, near = sensor_degC(camera, nodes, powered), air_near_degC(camera, air, rng)
+    return Night(_observations(plan, session_id, grid_s, seen, stated, near, noise_px, before), truth)
 
 
 class _Plan:
@@ -172,20 +172,20 @@ def _air_degC(set_point_degC: Float) -> Float:
 
 
 def _observations(
-    plan: _Plan, session_id: str, grid_s: Float, seen: Float, told: Float, near: Float, noise_px: float, before: int
+    plan: _Plan, session_id: str, grid_s: Float, seen: Float, stated: Float, near: Float, noise_px: float, before: int
 ) -> Observations:
     """before: steps that are not recorded."""
     count = len(plan.roles)
     times_ns = START_NS + np.round(grid_s * NS_PER_S).astype(np.int64)
     frames_ns = START_NS + np.round(plan.frames_s * NS_PER_S).astype(np.int64)
-    on = np.isfinite(told)
+    on = np.isfinite(stated)
     nearest = np.clip(np.searchsorted(grid_s, plan.frames_s, side="right") - 1, 0, len(grid_s) - 1)
     nearest = np.where(on[nearest], nearest, np.minimum(nearest + 1, len(grid_s) - 1))
     since = np.arange(len(times_ns)) >= before
     switched = np.flatnonzero((np.diff(plan.powered, prepend=np.nan) != 0) | (np.arange(len(times_ns)) == before))
     switched = switched[switched >= before]
     supply = times_ns[switched] - STEP_S * NS_PER_S, plan.powered[switched]
-    history = History(times_ns[since], near[since], *supply, times_ns[on & since], told[on & since])
+    history = History(times_ns[since], near[since], *supply, times_ns[on & since], stated[on & since])
     return Observations(
         target=TARGET,
         sessions=(replace(facts(session_id), simulated=True),),
@@ -197,7 +197,7 @@ def _observations(
         role=np.array(plan.roles),
         step_id=plan.step_ids,
         chamber_degC=plan.chamber_degC,
-        camera_degC=told[nearest],
+        camera_degC=stated[nearest],
         air_degC=np.interp(plan.frames_s, grid_s, near),
         centres_px=seen,
         covariance_px2=np.tile(np.eye(2) * noise_px**2, (count, 54, 1, 1)),

@@ -157,7 +157,7 @@ class Night:
         log, count = self.log, len(self.log.frames)
         times, roles, chamber, camera, steps = zip(*log.frames, strict=True)
         truth = np.array(log.truth)
-        air, powered, told = (np.array(part) for part in (log.air, log.powered, log.camera))
+        air, powered, stated = (np.array(part) for part in (log.air, log.powered, log.camera))
         return Observations(
             target=TARGET,
             sessions=(SessionFacts(session_id, "night", "TS-0001", "operator", "0.1.0", True, 0),),
@@ -180,7 +180,7 @@ class Night:
                     History(
                         *(np.array([time_ns for time_ns, _ in log.air], np.int64), air[:, 1]),
                         *(np.array([time_ns for time_ns, _ in log.powered], np.int64), powered[:, 1]),
-                        *(np.array([time_ns for time_ns, _ in log.camera], np.int64), told[:, 1]),
+                        *(np.array([time_ns for time_ns, _ in log.camera], np.int64), stated[:, 1]),
                     )
                 ),
             ),

@@ -78,7 +78,7 @@ def session(
     slack = [_slack(sensor - 24, kind) if plays else np.zeros(len(sensor)) for kind in (PLAYS_X, PLAYS_Y)]
     truth = np.array([_image(*(float(own[k]) for own in (sensor - 39, lens - 34, base - 24, *slack))) for k in at])
     times_ns = START_NS + np.arange(len(air)) * STEP_S * NS_PER_S
-    told = sensor + 0.01 * rng.standard_normal(len(sensor))
+    stated = sensor + 0.01 * rng.standard_normal(len(sensor))
     on = powered > 0
     index = np.array(at)
     count = len(at)
@@ -93,13 +93,13 @@ def session(
         role=np.array(roles),
         step_id=tuple(steps),
         chamber_degC=np.array(chamber),
-        camera_degC=told[index],
+        camera_degC=stated[index],
         air_degC=air_degC[index],
         centres_px=truth + NOISE_PX * rng.standard_normal(truth.shape),
         covariance_px2=np.tile(np.eye(2) * NOISE_PX**2, (count, 54, 1, 1)),
         flags=np.zeros((count, 54), np.uint8),
         reasons=("",) * count,
-        histories=(History(times_ns, air_degC, times_ns[:-1], powered[1:], times_ns[on], told[on]),),
+        histories=(History(times_ns, air_degC, times_ns[:-1], powered[1:], times_ns[on], stated[on]),),
     )
     return found, truth
 

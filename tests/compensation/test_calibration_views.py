@@ -1,4 +1,4 @@
-"""A camera from pictures of a board in any poses, against the drawn truth: no table is told."""
+"""A camera from pictures of a board in any poses, against the drawn truth: no table is given."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_held_out_pictures_are_as_good_as_the_noise_where_the_model_holds_and_wo
     assert cross_validated_px(seen(rippled), board(rippled)) > 0.008
 
 
-def test_the_uncertainty_is_told_in_words_larger_at_the_corners_and_for_fewer_pictures():
+def test_the_uncertainty_is_stated_in_words_larger_at_the_corners_and_for_fewer_pictures():
     laboratory = draw(Truth(seed=1))
     many, few = (calibrate_views(seen(laboratory, every), board(laboratory)) for every in (1, 4))
     pixels = np.array([[1223.5, 1023.5], [0.0, 0.0]])

@@ -141,7 +141,7 @@ def test_a_degree_that_does_not_exist_is_refused_before_the_long_work(recorded: 
         (["--loud"], "--loud"),
     ],
 )
-def test_wrong_arguments_are_told_in_one_line(arguments: list[str], sentence: str, tmp_path: Path):
+def test_wrong_arguments_are_reported_in_one_line(arguments: list[str], sentence: str, tmp_path: Path):
     assert_refused(run(*arguments), sentence, tmp_path / "out", 2)
 
 

@@ -72,7 +72,7 @@ def test_a_model_scores_a_session_it_was_not_fitted_to(model: PaperModel):
     np.testing.assert_allclose(evaluate(model, other).rms_after_px, NOISE_PX * np.sqrt(1 + 1 / 8), rtol=0.06)
 
 
-def test_temperatures_beyond_the_fit_are_told(model: PaperModel):
+def test_temperatures_beyond_the_fit_are_reported(model: PaperModel):
     hotter = observations(quadratic, NOISE_PX, held_out_degC=(34.0, 60.0))
     np.testing.assert_array_equal(evaluate(model, hotter).outside, np.repeat([False, True], 2 * 54))
 

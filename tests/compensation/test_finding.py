@@ -1,4 +1,4 @@
-"""Markers found piece by piece: by whoever, wherever, the same bits; a killed worker loses nothing; nothing is found
+"""Markers found piece by piece: by any process, the same bits; a killed worker loses nothing; nothing is found
 twice."""
 
 import multiprocessing
@@ -122,7 +122,7 @@ def test_a_process_ends_with_the_command_that_was_killed(tmp_path: Path):
 
 
 class Poison(Piece):
-    """Kills whoever receives it."""
+    """Kills the process that receives it."""
 
     def __reduce__(self):
         return os._exit, (1,)
@@ -171,19 +171,19 @@ def nobody(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
 def test_what_was_found_is_kept_also_for_a_copy_elsewhere(
     recorded: Recorded, pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
 ):
-    told: list[int] = []
-    first = Finder(in_turn, tmp_path / "kept")(pieces, told.append)
-    assert told == [0, 5, 10, 15, sum(piece.frames for piece in pieces)]
+    reported: list[int] = []
+    first = Finder(in_turn, tmp_path / "kept")(pieces, reported.append)
+    assert reported == [0, 5, 10, 15, sum(piece.frames for piece in pieces)]
     shutil.copytree(recorded.path, tmp_path / "copy")
     session = Session.open(tmp_path / "copy")
     copies = pieces_of(session, session_target(session), frames_per_piece=5)
-    again = Finder(nobody, tmp_path / "kept")(copies, told.append)
+    again = Finder(nobody, tmp_path / "kept")(copies, reported.append)
     for one, other, expected in zip(first, again, serial, strict=True):
         assert_same(one, expected)
         assert_same(other, expected)
 
 
-def test_another_content_target_noise_or_range_is_found_anew(pieces: list[Piece], tmp_path: Path):
+def test_another_content_target_noise_or_range_is_found_again(pieces: list[Piece], tmp_path: Path):
     Finder(in_turn, tmp_path / "kept")(pieces[:1], lambda done: None)
     changed = tmp_path / "changed.mcap"
     content = bytearray(pieces[0].segment.read_bytes())
@@ -217,7 +217,7 @@ def test_frames_whose_markers_are_kept_are_not_read_again(
         assert_same(found, expected)
 
 
-def test_what_is_kept_but_damaged_is_found_anew(pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path):
+def test_what_is_kept_but_damaged_is_found_again(pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path):
     Finder(in_turn, tmp_path)(pieces[:1], lambda done: None)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()

@@ -207,9 +207,9 @@ def test_a_few_markers_cannot_vouch_for_another_ones_shape():
 
 def test_without_a_noise_model_the_covariance_comes_from_the_residuals():
     image = photograph(HALF, half_frame(), 3)
-    told, untold = detect(image, PAPER, noise=CAMERA), detect(image, PAPER, noise=Noise(4 * (1 + 1 / 12), 4 / 40))
-    np.testing.assert_allclose(untold.chi, told.chi / 2, rtol=1e-3)
-    np.testing.assert_allclose(untold.covariance_px2, told.covariance_px2, rtol=1e-2)
+    known, unknown = detect(image, PAPER, noise=CAMERA), detect(image, PAPER, noise=Noise(4 * (1 + 1 / 12), 4 / 40))
+    np.testing.assert_allclose(unknown.chi, known.chi / 2, rtol=1e-3)
+    np.testing.assert_allclose(unknown.covariance_px2, known.covariance_px2, rtol=1e-2)
     assert np.median(detect(image, PAPER).chi) == pytest.approx(1)
 
 

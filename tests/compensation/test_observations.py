@@ -79,10 +79,10 @@ def test_air_is_interpolated_between_readings_and_unknown_after_the_last(observe
 
 
 def test_progress_counts_frames(recorded: Recorded):
-    session, told = Session.open(recorded.path), list[tuple[float, str]]()
-    observe_session(session, session_target(session), report=lambda done, text: told.append((done, text)))
+    session, reported = Session.open(recorded.path), list[tuple[float, str]]()
+    observe_session(session, session_target(session), report=lambda done, text: reported.append((done, text)))
     count = len(SEQUENCE)
-    assert told == [(done, f"frame {done} of {count}") for done in (0, 10, count)]  # the segments' ends
+    assert reported == [(done, f"frame {done} of {count}") for done in (0, 10, count)]  # the segments' ends
 
 
 @pytest.mark.parametrize(("word", "simulated"), [("true", True), ("false", False), (None, None), ("maybe", None)])
@@ -109,7 +109,7 @@ def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
         observe_session(session, session_target(session))
 
 
-def test_frames_of_a_capture_that_was_begun_anew_do_not_count(tmp_path: Path):
+def test_frames_of_a_capture_that_was_restarted_do_not_count(tmp_path: Path):
     after_ns = START_NS + 2 * 60 * NS_PER_S + 1
     again = restarted(after_ns, "step-1", 1, "after a long interruption")
     asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))

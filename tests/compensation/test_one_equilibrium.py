@@ -17,7 +17,7 @@ from tests.recording.recorded import START_NS, frame, record
 
 
 def items(gap_index: int, *, superseded: bool = False, role: str = "fit"):
-    """A frame each half second; the gap comes before the one of `gap_index`, and is told in the end."""
+    """A frame each half second; the gap comes before the one of `gap_index`, and is stated in the end."""
 
     def at(time_ns, index):
         parameters = {"role": role, "chamber_degC": 24.0}
@@ -43,8 +43,8 @@ async def test_frames_of_both_sides_are_refused_unless_somebody_wants_them(tmp_p
         refused = CliRunner().invoke(app, command)
         assert refused.exit_code != 0
         assert "only with --across-gap" in refused.output
-        told = CliRunner().invoke(app, [*command, "--across-gap"])
-        assert "across-gap" not in told.output  # it gets as far as these frames, which show no target, take it
+        reported = CliRunner().invoke(app, [*command, "--across-gap"])
+        assert "across-gap" not in reported.output  # it gets as far as these frames, which show no target, take it
 
 
 @pytest.mark.parametrize(("gap_index", "options"), [(0, {}), (6, {"superseded": True}), (6, {"role": "warm_up"})])

@@ -190,7 +190,7 @@ def test_the_uncertainty_is_what_noise_and_model_make(numbers: Numbers):
     assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in page_of("", list(uncertainty_section(numbers)))
 
 
-def test_an_interval_that_claims_too_much_is_told(numbers: Numbers):
+def test_an_interval_that_claims_too_much_is_reported(numbers: Numbers):
     assert numbers.score is not None
     too_few = replace(numbers, score=replace(numbers.score, coverage_95=(0.96, 0.34)))
     assert "thermal lag, hysteresis" not in page_of("", list(result_section(numbers)))
@@ -281,7 +281,7 @@ def test_its_numbers_do_not_take_the_place_of_another_file(tmp_path: Path):
             check_report_writable(tmp_path / page_path, model)
 
 
-def test_what_the_model_leaves_of_a_warm_up_is_told(numbers: Numbers, page: str, analysed: Analysed):
+def test_what_the_model_leaves_of_a_warm_up_is_reported(numbers: Numbers, page: str, analysed: Analysed):
     night, model, _ = analysed
     (warm_up,) = numbers.warm_ups  # four of the frames at the reference: nothing is left but noise
     np.testing.assert_allclose(warm_up.left_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=0.15)

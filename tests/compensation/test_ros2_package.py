@@ -105,7 +105,7 @@ def test_what_is_unknown_is_said_and_camera_info_passes_unchanged(node: StubNode
 
 
 @pytest.mark.parametrize("jump_s", [3600.0, -5.0])
-def test_a_gap_or_a_clock_that_steps_back_begins_anew(node: StubNode, jump_s: float):
+def test_a_gap_or_a_clock_that_steps_back_begins_again(node: StubNode, jump_s: float):
     _, seconds = begun(node)
     assert node.published["diagnostics"][-1].status[0].level == b"\0"
     node.send("camera_temperature", temperature(seconds + jump_s, 44.0))

@@ -154,8 +154,8 @@ def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, ther
     off = ~np.isin(record.ambient_ns, record.camera_ns)
     for index in range(1, end):
         mean = (record.ambient_degC[index] + record.ambient_degC[index - 1]) / 2
-        told = np.nan if off[index] else camera_degC[index]
-        state.advance(10.0, mean, record.powered[index - 1], told)
+        stated = np.nan if off[index] else camera_degC[index]
+        state.advance(10.0, mean, record.powered[index - 1], stated)
     at_ns = record.ambient_ns[end - 1 : end]
     offline = states_at(record, thermal.memory, at_ns, camera_degC[end - 1 : end])
     point = np.array([[1200.0, 1000.0]])
@@ -195,7 +195,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
         load_model(tmp_path / "model.json")
 
 
-def test_what_the_thermal_form_needs_is_told(night: Seen):
+def test_what_the_thermal_form_needs_is_reported(night: Seen):
     with pytest.raises(SessionError, match="no history of the air"):
         fit(without_histories(quadratic), form="thermal")
     with pytest.raises(ConfigError, match="has no degree"):

@@ -24,12 +24,12 @@ def history(
     if gap is not None:
         times_s = times_s[(times_s < gap[0]) | (times_s > gap[1])]
     air = np.where(times_s > STEP_AT_S, 34.0, 24.0)
-    told = air + camera_excess_K
+    stated = air + camera_excess_K
     if resolution_K:
-        told = resolution_K * np.round(told / resolution_K)
+        stated = resolution_K * np.round(stated / resolution_K)
     on = times_s >= on_at_s
     powered_ns, powered = np.array([0, on_at_s], np.int64) * S, np.array([float(on_at_s == 0), 1.0])
-    return History(times_s * S, air, powered_ns, powered, times_s[on] * S, told[on])
+    return History(times_s * S, air, powered_ns, powered, times_s[on] * S, stated[on])
 
 
 def at(record: History, *seconds: int, camera_degC: float = 54.0) -> States:
@@ -61,13 +61,13 @@ def test_a_warm_start_is_a_guess_and_a_cold_one_is_known():
     np.testing.assert_allclose(half.power_lag[0], 0.5, atol=0.02)
 
 
-@pytest.mark.parametrize(("told_degC", "known"), [(21.0, True), (27.0, False)])
-def test_a_camera_that_is_as_cold_as_the_air_when_it_is_switched_on_was_in_equilibrium(told_degC: float, known: bool):
+@pytest.mark.parametrize(("stated_degC", "known"), [(21.0, True), (27.0, False)])
+def test_a_camera_that_is_as_cold_as_the_air_when_it_is_switched_on_was_in_equilibrium(stated_degC: float, known: bool):
     state = ThermalState(MEMORY.taus_s, MEMORY.plays_K, MEMORY.self_heating_K)
     for _ in range(100):
         state.advance(10.0, 20.0, 0.0, math.nan)
     assert state.settled_s == 1000.0
-    state.advance(10.0, 20.0, 1.0, told_degC)
+    state.advance(10.0, 20.0, 1.0, stated_degC)
     assert state.settled_s == (math.inf if known else 1010.0)
 
 
@@ -123,14 +123,14 @@ def test_before_the_record_and_without_one_only_the_camera_is_known():
 def test_a_display_in_quarters_is_refined_between_its_steps():
     times_s = np.arange(0, 10_000, 5)
     true = 24 + 18 * -np.expm1(-times_s / 700) + 2 * -np.expm1(-times_s / 3000)
-    told = 0.25 * np.round(true / 0.25)
+    stated = 0.25 * np.round(true / 0.25)
     powered_ns = np.array([0], np.int64)
-    record = refined(History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, told))
+    record = refined(History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, stated))
     assert record.resolution_K == 0.25
     error = record.camera_degC - true
-    assert np.std(told - true) > 0.06
+    assert np.std(stated - true) > 0.06
     assert np.std(error) < 0.02
-    assert np.abs(record.camera_degC - told).max() <= 0.125 + 1e-9
+    assert np.abs(record.camera_degC - stated).max() <= 0.125 + 1e-9
     fine = History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, true)
     np.testing.assert_array_equal(refined(fine).camera_degC, true)
 

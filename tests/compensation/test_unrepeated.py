@@ -1,4 +1,4 @@
-"""What does not repeat, named: slips move the image along one line, fixings that settle anew in any direction."""
+"""What does not repeat, named: slips move the image along one line, fixings that settle again in any direction."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def of(seed: int, *effects: str, moving: bool = False) -> Unrepeated:
 
 
 @pytest.mark.parametrize("seed", [2300, 2301])
-def test_slips_are_told_from_fixings_that_settle_anew(seed: int) -> None:
+def test_slips_are_distinguished_from_fixings_that_settle_again(seed: int) -> None:
     slips, settling = of(seed, "stick_slip"), of(seed, "unrepeated")
     assert slips.cause is Cause.SLIPS
     assert settling.cause is Cause.SETTLING
@@ -54,9 +54,9 @@ def test_the_report_says_so(tmp_path: Path) -> None:
     model = fit(observed, form="thermal")
     write_report(tmp_path / "report.html", observed, model, evaluate(model, observed))
     assert "sticks and slips" in (tmp_path / "report.html").read_text()
-    (told,) = json.loads((tmp_path / "report.json").read_text())["unrepeated"]
-    assert (told["cause"], told["session_id"]) == ("slips", "night-1")
-    assert told["along_px"] > 0.003
+    (reported,) = json.loads((tmp_path / "report.json").read_text())["unrepeated"]
+    assert (reported["cause"], reported["session_id"]) == ("slips", "night-1")
+    assert reported["along_px"] > 0.003
 
 
 def test_slips_of_a_camera_on_its_way() -> None:

@@ -103,7 +103,7 @@ def test_frames_of_a_position_are_averaged(laboratory: Laboratory, camera: Camer
     assert np.all(nine.mean_um < 0.6 * one.mean_um)
 
 
-def test_the_tables_repeatability_is_told_by_v0_seen_again(laboratory: Laboratory, camera: Camera):
+def test_the_tables_repeatability_is_measured_by_v0_seen_again(laboratory: Laboratory, camera: Camera):
     many = (24.0,) * 18
     moving = undrifted(laboratory, camera, table_mm=(0.001, 0.0, 0.004), temperatures_degC=many)
     assert moving.table_um == pytest.approx([1, 0, 4], rel=0.25, abs=0.3)

@@ -29,7 +29,7 @@ def shifted(scene: Scene, x_px: float, y_px: float) -> Scene:
 
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
 @pytest.mark.parametrize("cut", ["beyond", "half", "a tenth"])
-def test_a_side_of_the_grid_beyond_the_frame_is_told_by_the_frame(side: str, cut: str):
+def test_a_side_of_the_grid_beyond_the_frame_is_found_by_the_frame(side: str, cut: str):
     scene = replace(SCENE, roll_deg=0)
     truth, (width, height) = true_centres_px(scene), scene.size
     radius = 4 * scene.f_px / scene.distance_mm

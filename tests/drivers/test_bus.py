@@ -368,7 +368,7 @@ async def test_a_soak_with_a_fault_in_every_sixth_reply_gives_no_wrong_value(
     assert failed > 25
 
 
-async def test_a_second_opener_is_told_that_the_port_is_taken(bus: Bus) -> None:
+async def test_a_second_opener_learns_that_the_port_is_taken(bus: Bus) -> None:
     other = Bus("other", BusSettings(address=bus.address), WallClock())
     with pytest.raises(Unreachable, match="another program has it open"):
         await other.open()

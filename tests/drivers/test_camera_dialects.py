@@ -209,7 +209,7 @@ async def test_a_selector_that_the_camera_never_answers_for_costs_the_temperatur
 
 
 class Asked:
-    """A camera that has a temperature behind a selector, for which it answers as told."""
+    """A camera that has a temperature behind a selector, for which it answers as prepared."""
 
     def __init__(self, selector: int, others: int = 0) -> None:
         self._selector, self._others = selector, others
@@ -222,7 +222,7 @@ class Asked:
 
     def set_string(self, feature: str, value: str) -> None:
         if self._selector:
-            raise AravisError(DEVICE_ERRORS, self._selector, "as told")
+            raise AravisError(DEVICE_ERRORS, self._selector, "as prepared")
 
     def read_register(self, address: int) -> int:
         if self._others:
@@ -238,9 +238,9 @@ def test_whether_it_is_the_selector_alone_that_is_not_answered_for_decides(code:
     assert isinstance(found, NoTemperature)
     assert (found.cause, found.reason) == (
         cause,
-        "DeviceTemperature of Where 'Sensor' cannot be read (as told)",
+        "DeviceTemperature of Where 'Sensor' cannot be read (as prepared)",
     )
-    with pytest.raises(AravisError, match="as told"):
+    with pytest.raises(AravisError, match="as prepared"):
         find_temperature(cast("GigeDevice", Asked(5, others=5)), wanted)
 
 

@@ -124,7 +124,7 @@ async def test_a_set_point_is_written_when_it_changes_and_never_outside_what_is_
 
 
 @pytest.mark.parametrize("make", MAKES)
-async def test_a_write_without_effect_is_told_and_not_repeated(make: str, tmp_path: Path):
+async def test_a_write_without_effect_is_reported_and_not_repeated(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         bench.fake.ignores_writes = True
@@ -135,7 +135,7 @@ async def test_a_write_without_effect_is_told_and_not_repeated(make: str, tmp_pa
         assert (await bench.read())["pv"].value == pytest.approx(24.0, abs=2)  # it is watched all the same
 
 
-async def test_a_panel_that_protects_is_told_with_what_to_do_and_watched_all_the_same(tmp_path: Path):
+async def test_a_panel_that_protects_is_reported_with_what_to_do_and_watched_all_the_same(tmp_path: Path):
     async with bench_of("espec", "tcp", tmp_path) as bench:
         await bench.driver.open()
         bench.fake.protected = True
@@ -145,7 +145,7 @@ async def test_a_panel_that_protects_is_told_with_what_to_do_and_watched_all_the
 
 
 @pytest.mark.parametrize("make", MAKES)
-async def test_what_was_changed_at_the_panel_is_told_with_both_values_and_left(make: str, tmp_path: Path):
+async def test_what_was_changed_at_the_panel_is_reported_with_both_values_and_left(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         await bench.driver.set_temperature(30.0)
@@ -170,7 +170,7 @@ async def test_what_was_changed_at_the_panel_is_told_with_both_values_and_left(m
         ("julabo", "01 LOW LEVEL ALARM", "-01 LOW LEVEL ALARM"),
     ],
 )
-async def test_a_latched_alarm_is_told_and_nothing_is_started_until_it_is_reset(
+async def test_a_latched_alarm_is_reported_and_nothing_is_started_until_it_is_reset(
     make: str, code: str, said: str, tmp_path: Path
 ):
     async with bench_of(make, "tcp", tmp_path) as bench:
@@ -197,7 +197,7 @@ async def test_a_set_point_that_is_clamped_is_refused_by_what_it_reads(make: str
     ("make", "said"),
     [("espec", "DATA OUT OF RANGE"), ("simserv", "does not take these parameters"), ("julabo", "VALUE TOO LARGE")],
 )
-async def test_a_set_point_that_the_unit_refuses_is_told_in_its_words(make: str, said: str, tmp_path: Path):
+async def test_a_set_point_that_the_unit_refuses_is_reported_in_its_words(make: str, said: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         bench.fake.limits_degC = (0.0, 35.0)
@@ -368,7 +368,7 @@ async def test_one_whose_connection_another_program_has_is_unreachable_and_back_
 
 
 @pytest.mark.parametrize("make", MAKES)
-async def test_one_that_restarted_stopped_is_told_and_not_started_by_itself(make: str, tmp_path: Path):
+async def test_one_that_restarted_stopped_is_reported_and_not_started_by_itself(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         await bench.driver.set_temperature(30.0)
@@ -380,7 +380,7 @@ async def test_one_that_restarted_stopped_is_told_and_not_started_by_itself(make
 
 
 @pytest.mark.parametrize("make", MAKES)
-async def test_one_that_restarted_running_at_its_old_set_point_is_told_and_left(make: str, tmp_path: Path):
+async def test_one_that_restarted_running_at_its_old_set_point_is_reported_and_left(make: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         await bench.driver.set_temperature(30.0)

@@ -95,17 +95,17 @@ async def test_time_stands_still_as_long_as_the_loop_has_anything_to_run():
     assert ended == [NS_PER_S]
 
 
-async def test_the_simulator_is_told_before_the_sleeper_wakes():
-    told: list[int] = []
+async def test_the_simulator_gets_the_time_before_the_sleeper_wakes():
+    reported: list[int] = []
 
     async def advance(time_ns: int) -> None:
-        told.append(time_ns)
+        reported.append(time_ns)
 
     clock = VirtualClock(0, advance)
 
     async def sleeper() -> None:
         await clock.sleep_until(3 * NS_PER_S)
-        assert told == [3 * NS_PER_S]
+        assert reported == [3 * NS_PER_S]
 
     await driven(clock, sleeper())
 
@@ -246,4 +246,4 @@ def test_a_thread_that_waits_is_late_by_no_more_than_a_second_after_a_suspend(mo
 def test_boot_time_is_that_of_the_kernel():
     before_ns = boot_time_ns()
     uptime_ns = seconds_ns(float(Path("/proc/uptime").read_text().split()[0]))
-    assert before_ns - seconds_ns(0.011) <= uptime_ns <= boot_time_ns()  # which is told to 10 ms
+    assert before_ns - seconds_ns(0.011) <= uptime_ns <= boot_time_ns()  # which is given to 10 ms

@@ -187,7 +187,7 @@ async def test_a_watchdog_that_trips_and_is_kept_by_what_we_write_is_relied_upon
         assert (bench.fake.trips, bench.fake.output_mA(), bench.heater_W()) == (1, 4.0, 0.0)
 
 
-async def test_a_watchdog_that_wants_another_protocol_is_told():
+async def test_a_watchdog_that_wants_another_protocol_is_reported():
     bench = Bench()
     bench.fake.refreshed_by = "nothing"
     async with driven(bench) as module:
@@ -195,7 +195,7 @@ async def test_a_watchdog_that_wants_another_protocol_is_told():
             await module.test_dead_man()
 
 
-async def test_a_watchdog_that_does_not_trip_is_told():
+async def test_a_watchdog_that_does_not_trip_is_reported():
     class Deaf(FakeHeatModule):
         def _watch(self, time_ns: int) -> None: ...
 

@@ -93,7 +93,7 @@ async def test_a_pulse_at_once_begins_a_cycle():
     ("percent", "forced", "text"),
     [(50, True, "was on 10.0 s after its time"), (100, False, "was off 2.0 s before its time")],
 )
-async def test_a_relay_that_is_not_as_it_was_left_is_switched_off_and_told(percent: float, forced: bool, text: str):
+async def test_a_relay_that_is_not_as_it_was_left_is_switched_off_and_reported(percent: float, forced: bool, text: str):
     clock = FollowedClock(0)
     board = Board(clock)
     heat = HeatPulses(board, SETTINGS, clock)
@@ -113,7 +113,7 @@ def test_pulses_and_pauses_that_fill_the_cycle_are_refused():
         PulsesSettings(cycle_s=10, min_on_s=3, min_off_s=3)
 
 
-async def test_a_relay_that_stays_on_is_told_as_not_obeying_until_it_is_off():
+async def test_a_relay_that_stays_on_is_reported_as_not_obeying_until_it_is_off():
     class Stuck(Board):
         is_stuck: bool = True
 

@@ -106,14 +106,14 @@ async def test_contacts_of_a_board_exchanged_while_it_was_silent_are_not_read(be
     ("found", "is_same"),
     [
         (A, True),
-        (Identity("Make", "M", "", ""), True),  # what is not told cannot differ
+        (Identity("Make", "M", "", ""), True),  # what is not stated cannot differ
         (Identity("Make", "M", "2", "2.00"), False),
         (Identity("Make", "M", "1", "2.01"), False),
         (Identity("Make", "N", "1", "2.00"), False),
         (Identity("Other", "M", "1", "2.00"), False),
     ],
 )
-def test_another_device_is_told_by_what_both_tell(found: Identity, is_same: bool) -> None:
+def test_another_device_is_recognised_by_what_both_state(found: Identity, is_same: bool) -> None:
     assert same_device("camera", found, None) == found
     if is_same:
         assert same_device("camera", found, A) == found

@@ -85,7 +85,7 @@ def test_a_link_may_be_closed_twice(address: str) -> None:
     link.close()
 
 
-def test_a_second_opener_of_a_serial_port_is_told_that_it_is_taken(tmp_path: Path) -> None:
+def test_a_second_opener_of_a_serial_port_learns_that_it_is_taken(tmp_path: Path) -> None:
     wire = PtyWire(tmp_path / "port", Echo(), LinkFaults())
     address = f"serial:{tmp_path / 'port'}"
     with closing(wire), closing(open_link("stage", address, LINE)) as first:
@@ -95,7 +95,7 @@ def test_a_second_opener_of_a_serial_port_is_told_that_it_is_taken(tmp_path: Pat
         assert read_all(first, 4) == b"mine"
 
 
-def test_a_missing_port_is_told_as_such(tmp_path: Path) -> None:
+def test_a_missing_port_is_reported_as_such(tmp_path: Path) -> None:
     with pytest.raises(Unreachable, match=rf"^stage: cannot open {tmp_path}/none: No such file or directory$"):
         open_link("stage", f"serial:{tmp_path / 'none'}", LINE)
 
@@ -106,14 +106,14 @@ def test_what_is_no_terminal_is_no_port(tmp_path: Path) -> None:
         open_link("stage", f"serial:{tmp_path / 'file'}", LINE)
 
 
-def test_a_refused_tcp_connection_is_told_as_such() -> None:
+def test_a_refused_tcp_connection_is_reported_as_such() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(Unreachable, match=rf"^stage: cannot connect to 127\.0\.0\.1:{port}: Connection refused$"):
         open_link("stage", f"tcp:127.0.0.1:{port}", LINE)
 
 
-def test_a_tcp_peer_that_hangs_up_is_told_as_such() -> None:
+def test_a_tcp_peer_that_hangs_up_is_reported_as_such() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server, closing(linked(server)) as link:
         server.accept()[0].close()
         with pytest.raises(Unreachable, match=r"^stage: 127\.0\.0\.1:\d+ closed the connection$"):

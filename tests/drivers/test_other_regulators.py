@@ -104,7 +104,7 @@ async def test_another_make_heats_to_its_set_point_and_stops(make: str):
 
 @pytest.mark.parametrize("make", FAKES)
 async def test_no_set_point_wears_the_memory(make: str):
-    """The F4T and a Binder have no way to be told not to save: the same set-point again is not sent."""
+    """The F4T and a Binder cannot be asked not to save: the same set-point again is not sent."""
     bench = Bench(make)
     async with driven(bench, map_of(make)) as regulator:
         await regulator.open()
@@ -139,7 +139,7 @@ async def test_a_stop_of_which_the_second_write_is_lost_is_sent_again_whole():
         assert bench.plant.heater_on_fraction == 0
 
 
-async def test_a_loop_break_is_told():
+async def test_a_loop_break_is_reported():
     bench = Bench("eurotherm-3200")
     async with driven(bench, map_of("eurotherm-3200")) as regulator:
         await regulator.open()
@@ -158,7 +158,7 @@ async def test_an_open_door_is_a_fault():
 
 
 async def test_a_remote_set_point_that_is_not_refreshed_is_given_up_for_the_local_one():
-    """What keeps the chamber safe when the computer dies; told by a bit while it lives."""
+    """What keeps the chamber safe when the computer dies; shown by a bit while it lives."""
     bench = Bench("eurotherm-3200")
     async with driven(bench, map_of("eurotherm-3200")) as regulator:
         await regulator.open()

@@ -37,7 +37,7 @@ def bench(text: str = MAP) -> RegisterMap:
 
 
 @pytest.mark.parametrize("file", sorted(MAPS.glob("*.yaml")), ids=lambda file: file.stem)
-def test_every_map_of_the_house_loads(file: Path) -> None:
+def test_every_installed_map_loads(file: Path) -> None:
     register_map = load_register_map(file)
     assert register_map.polled()
     assert all(

@@ -48,7 +48,7 @@ class Bench:
         self.imager = ThermalImager(
             "imager", ThermalImagerSettings.model_validate(known), self.clock, self.items.append
         )
-        self.told: dict[str, Reading] = {}
+        self.reported: dict[str, Reading] = {}
 
     async def wait(self, duration_s: float) -> dict[str, Reading]:
         """The latest readings, looked for every 2 s."""
@@ -56,8 +56,8 @@ class Bench:
             self.clock.step(2.0)
             for step in self.sight.on_step:
                 step(self.clock.now_ns(), 2.0)
-            self.told |= {reading.channel.partition(".")[2]: reading for reading in await self.imager.read()}
-        return self.told
+            self.reported |= {reading.channel.partition(".")[2]: reading for reading in await self.imager.read()}
+        return self.reported
 
     def events(self, kind: str) -> list[Event]:
         return [item for item in self.items if isinstance(item, Event) and item.kind == kind]
@@ -88,21 +88,21 @@ async def test_each_picture_gives_its_spots_and_itself(bench: Bench) -> None:
     assert taken.data["emissivity"] == dict.fromkeys(SPOTS, 0.95)
 
 
-async def test_a_reading_is_told_once(bench: Bench) -> None:
+async def test_a_reading_is_reported_once(bench: Bench) -> None:
     await bench.wait(80)
-    before = bench.told["lens"]
-    bench.told.clear()
+    before = bench.reported["lens"]
+    bench.reported.clear()
     await bench.wait(20)
-    assert bench.told == {}
+    assert bench.reported == {}
     await bench.wait(60)
-    assert bench.told["lens"].time_ns > before.time_ns
+    assert bench.reported["lens"].time_ns > before.time_ns
 
 
 async def test_half_a_file_waits_for_its_other_half(bench: Bench) -> None:
     bench.fake.cut = True
     await bench.wait(100)
     assert bench.items == []
-    assert bench.told["lens"].quality is Quality.BAD
+    assert bench.reported["lens"].quality is Quality.BAD
     bench.fake.cut = False
     await bench.wait(10)
     assert [original.name for original in bench.originals()] == ["FLIR0001.jpg"]
@@ -138,10 +138,10 @@ async def test_a_bad_picture_is_left_out_and_left_alone(fault: str, value: objec
     (event,) = bench.events("picture_left_out")
     assert reason in str(event.data["reason"])
     assert (bench.fake.folder / "FLIR0001.jpg").exists()
-    assert bench.told["lens"].quality is Quality.BAD
+    assert bench.reported["lens"].quality is Quality.BAD
     setattr(bench.fake, fault, sound)
     await bench.wait(60)
-    assert bench.told["lens"].quality is Quality.GOOD
+    assert bench.reported["lens"].quality is Quality.GOOD
     await bench.imager.close()
 
 
@@ -155,7 +155,7 @@ async def test_the_same_picture_under_a_new_name_counts_once(bench: Bench) -> No
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 3600.0, -7200.0])
-async def test_a_wrong_clock_is_told_and_set_right(bench: Bench, ahead_s: float) -> None:
+async def test_a_wrong_clock_is_reported_and_set_right(bench: Bench, ahead_s: float) -> None:
     bench.fake.clock_s = ahead_s
     readings = await bench.wait(80)
     taken_ns = START_NS + seconds_ns(62.0)
@@ -165,7 +165,9 @@ async def test_a_wrong_clock_is_told_and_set_right(bench: Bench, ahead_s: float)
 
 
 @pytest.mark.parametrize("back_s", [300.0, 7200.0])
-async def test_a_clock_that_is_set_back_on_the_way_costs_one_picture_and_is_told(bench: Bench, back_s: float) -> None:
+async def test_a_clock_that_is_set_back_on_the_way_costs_one_picture_and_is_reported(
+    bench: Bench, back_s: float
+) -> None:
     await bench.wait(80)
     bench.fake.clock_s = -back_s
     await bench.wait(60)
@@ -189,7 +191,7 @@ async def test_old_pictures_that_are_copied_into_the_folder_do_not_set_its_clock
     for number, old in enumerate(sorted(other.folder.iterdir())):
         (bench.fake.folder / f"OLD_{number}.jpg").write_bytes(old.read_bytes())
         await bench.wait(6)
-    before = bench.told["clock_offset"].value
+    before = bench.reported["clock_offset"].value
     bench.fake.stopped = False
     readings = await bench.wait(120)
     assert len(bench.originals()) >= 7
@@ -208,7 +210,7 @@ async def test_without_new_pictures_the_last_ones_become_doubtful(bench: Bench) 
     assert readings["lens"].quality is Quality.GOOD
 
 
-async def test_a_folder_that_goes_and_comes_is_told_and_read_again(bench: Bench) -> None:
+async def test_a_folder_that_goes_and_comes_is_reported_and_read_again(bench: Bench) -> None:
     await bench.wait(80)
     bench.fake.unplugged = True
     readings = await bench.wait(10)

@@ -188,7 +188,7 @@ def test_after_two_repeats_a_query_is_given_up(client: XimcClient, controller: C
     ("answer", "sentence"),
     [(b"errc", "does not know gpos"), (b"errv", "out of range and the controller changed it")],
 )
-def test_an_error_of_configuration_is_told_and_not_repeated(
+def test_an_error_of_configuration_is_reported_and_not_repeated(
     client: XimcClient, controller: Controller, answer: bytes, sentence: str
 ) -> None:
     controller.faults.append(says(answer))
@@ -347,7 +347,7 @@ def test_a_port_unplugged_and_plugged_in_again_is_opened_again(controller: Contr
     wire.close()
 
 
-def test_a_tcp_connection_lost_is_made_anew(controller: Controller) -> None:
+def test_a_tcp_connection_lost_is_made_again(controller: Controller) -> None:
     wire = TcpWire("127.0.0.1", 0, lambda: controller, LinkFaults())
     port = wire.port
     with closing(XimcClient("linear", lambda: open_link("linear", f"tcp:127.0.0.1:{port}", LINE))) as client:

@@ -157,10 +157,10 @@ def test_a_capture_may_give_the_set_point_it_is_labelled_with():
 def test_what_cannot_be_done_is_one_sentence_with_its_place(text: str, sentence: str):
     with pytest.raises(ConfigError) as raised:
         planned(text)
-    told = str(raised.value)
-    assert told.startswith("own.yaml: ")
-    assert sentence in told
-    assert "\n" not in told
+    reported = str(raised.value)
+    assert reported.startswith("own.yaml: ")
+    assert sentence in reported
+    assert "\n" not in reported
 
 
 # Of the step ids as they were on 2026-11-22: a session of then is resumed only when its recipe gives the same plan.

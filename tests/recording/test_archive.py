@@ -116,7 +116,7 @@ def test_what_is_recorded_unfinished_or_may_be_resumed_is_not_copied(session: Pa
     assert not nas.exists()
 
 
-def test_a_full_disk_is_told_before_anything_is_copied(session: Path, nas: Path, monkeypatch):
+def test_a_full_disk_is_reported_before_anything_is_copied(session: Path, nas: Path, monkeypatch):
     monkeypatch.setattr(module.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 9, 1))
     with pytest.raises(SessionError, match=r"has 0.0 GB free, and night needs 0.1 GB"):
         archive(look_at(session), nas, "eva", 5)

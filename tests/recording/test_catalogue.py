@@ -151,15 +151,15 @@ def test_while_another_one_writes_the_index_the_list_is_complete(folder: Path, l
 
 
 def test_the_progress_counts_those_that_are_looked_at(folder: Path):
-    told: list[object] = []
+    reported: list[object] = []
 
     def progress(count: int):
-        told.append(count)
-        return lambda done, text: told.append((done, text))
+        reported.append(count)
+        return lambda done, text: reported.append((done, text))
 
     catalogue(folder, progress)
-    assert told[0] == 3
-    assert sorted(str(each[1]) for each in told[1:] if isinstance(each, tuple)) == ["a", "b", "c"]
-    told.clear()
+    assert reported[0] == 3
+    assert sorted(str(each[1]) for each in reported[1:] if isinstance(each, tuple)) == ["a", "b", "c"]
+    reported.clear()
     catalogue(folder, progress)
-    assert told == []
+    assert reported == []

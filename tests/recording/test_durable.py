@@ -58,7 +58,7 @@ class Stand:
         since_ns = self.recorder.waiting_since_ns
         return 0.0 if since_ns is None else (self.clock.now_ns() - since_ns) / NS_PER_S
 
-    def told(self, kind):
+    def reported(self, kind):
         return [event for event in self.events if event.kind == kind]
 
 
@@ -164,7 +164,7 @@ async def test_frames_alone_that_are_refused_wait_until_one_could_be_written(tmp
 
 
 @pytest.mark.parametrize("which", ["", "telemetry", "frames"])
-async def test_a_folder_that_was_removed_is_a_loss_at_once_and_nothing_is_made_anew_untold(tmp_path, which):
+async def test_a_folder_that_was_removed_is_a_loss_at_once_and_none_is_made_again_unasked(tmp_path, which):
     directory = tmp_path / "s"
     async with recording(directory, SETTINGS) as stand:
         await stand.seconds(5, frames=True)
@@ -174,15 +174,15 @@ async def test_a_folder_that_was_removed_is_a_loss_at_once_and_nothing_is_made_a
         assert "was removed while it was recorded into" in stand.recorder.folder_lost
         assert not (directory / which).exists()
         assert stand.age_s() > 2
-        (told,) = stand.told("folder_lost")
-        assert told.level == "error"
+        (reported,) = stand.reported("folder_lost")
+        assert reported.level == "error"
         stand.recorder.refound()
         assert stand.recorder.folder_lost == ""
         await stand.seconds(3, frames=True)
         assert stand.age_s() == 0
         assert stand.recorder.folder_lost == ""
         assert stand.recorder.saved.frames == 11
-    (loss,) = stand.told("recording_lost")
+    (loss,) = stand.reported("recording_lost")
     what = [which] if which else ["telemetry", "frames"]
     assert loss.level == "error"
     assert loss.data["what"] == what
@@ -204,7 +204,7 @@ async def test_a_folder_that_was_removed_is_a_loss_at_once_and_nothing_is_made_a
     assert "recording_lost" in [event.kind for event in session.events()]
 
 
-async def test_a_folder_that_was_renamed_is_gone_on_with_when_it_is_back(tmp_path):
+async def test_a_folder_that_was_renamed_is_continued_when_it_is_back(tmp_path):
     directory, other = tmp_path / "s", tmp_path / "other"
     async with recording(directory) as stand:
         await stand.seconds(3, frames=True)
@@ -235,7 +235,7 @@ async def test_a_renamed_folder_that_stays_away_keeps_what_it_has_and_another_on
         stand.recorder.refound()
         await stand.seconds(2, frames=True)
         assert (stand.age_s(), stand.recorder.folder_lost) == (0, "")
-    (loss,) = stand.told("recording_lost")
+    (loss,) = stand.reported("recording_lost")
     assert str(other) in loss.text
     assert [got.block_id for got in Session.open(directory).frames()] == [3, 4, 5, 6, 7]
     names = [path.name for path in (directory / "frames").iterdir()] + [
@@ -256,26 +256,26 @@ async def test_a_folder_that_cannot_be_made_again_stays_a_loss(tmp_path):
             await stand.seconds(2)
             stand.recorder.refound()
             await stand.seconds(1)
-            found.extend([stand.recorder.folder_lost, *stand.told("folder_not_made")])
+            found.extend([stand.recorder.folder_lost, *stand.reported("folder_not_made")])
 
     with pytest.raises(SessionError, match="messages were not saved"):
         await lose()
-    lost, told = found
+    lost, reported = found
     assert "was removed" in lost
-    assert "no folder can be made there again" in told.text
+    assert "no folder can be made there again" in reported.text
 
 
-async def test_readings_are_dropped_first_when_too_much_waits_and_that_is_told(tmp_path):
+async def test_readings_are_dropped_first_when_too_much_waits_and_that_is_reported(tmp_path):
     with tmpfs(tmp_path / "disk", "4m") as disk:
         async with recording(disk / "s", replace(SETTINGS, waiting_messages=30, segment_s=600.0)) as stand:
             await stand.seconds(2)
             (disk / "s").rename(disk / "t")
             await stand.seconds(30)
-            (told,) = stand.told("readings_dropped")
-            assert told.level == "error"
+            (reported,) = stand.reported("readings_dropped")
+            assert reported.level == "error"
             (disk / "t").rename(disk / "s")
             await stand.seconds(3)
-        (lost,) = stand.told("readings_lost")
+        (lost,) = stand.reported("readings_lost")
         session = Session.open(disk / "s")
         assert [event.text for event in session.events() if event.kind == "note"] == [f"second {k}" for k in range(35)]
         assert len(session.readings("thermometers.air")[0]) == 35 - lost.data["readings"]

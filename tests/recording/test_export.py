@@ -92,7 +92,7 @@ async def test_parquet_reads_back_every_value_exactly_and_typed(tmp_path):
 
 
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])
-async def test_reasons_and_qualities_are_told(tmp_path, table_format):
+async def test_reasons_and_qualities_are_reported(tmp_path, table_format):
     _, out = await exported(tmp_path, telemetry=table_format)
     rows = (csv_rows if table_format == "csv" else parquet_rows)(
         out / "telemetry" / f"sensors_temperature.{table_format}"
@@ -180,21 +180,21 @@ async def test_the_sidecar_tells_the_temperatures_of_its_frame(tmp_path):
     session, out = await exported(tmp_path)
     times_ns, air_degC = session.readings("thermometers.air")
     for number, shot in enumerate(session.frames(), 1):
-        told = sidecar(out / "frames" / f"{number:06d}.txt")
-        assert told["file"].strip() == f"{number:06d}.png"
-        assert told["time_utc"].strip() == utc_text(shot.time_ns)
-        assert int(told["time_ns"]) == shot.time_ns
-        np.testing.assert_array_equal(float(told["camera_temperature_degC"]), shot.camera_degC)
-        assert (float(told["exposure_s"]), float(told["gain_dB"])) == (shot.exposure_s, shot.gain_dB)
-        assert (int(told["block_id"]), int(told["dropped"])) == (shot.block_id, shot.dropped)
-        assert told["step_id"].strip() == shot.step_id
+        reported = sidecar(out / "frames" / f"{number:06d}.txt")
+        assert reported["file"].strip() == f"{number:06d}.png"
+        assert reported["time_utc"].strip() == utc_text(shot.time_ns)
+        assert int(reported["time_ns"]) == shot.time_ns
+        np.testing.assert_array_equal(float(reported["camera_temperature_degC"]), shot.camera_degC)
+        assert (float(reported["exposure_s"]), float(reported["gain_dB"])) == (shot.exposure_s, shot.gain_dB)
+        assert (int(reported["block_id"]), int(reported["dropped"])) == (shot.block_id, shot.dropped)
+        assert reported["step_id"].strip() == shot.step_id
         before = times_ns <= shot.time_ns
         assert before.sum() == number - 1
         np.testing.assert_array_equal(
-            float(told["thermometers.air_degC"]), air_degC[before][-1] if before.any() else np.nan
+            float(reported["thermometers.air_degC"]), air_degC[before][-1] if before.any() else np.nan
         )
         age_s = (shot.time_ns - times_ns[before][-1]) / NS_PER_S if before.any() else np.nan
-        np.testing.assert_array_equal(float(told["thermometers.air_age_s"]), age_s)
+        np.testing.assert_array_equal(float(reported["thermometers.air_age_s"]), age_s)
     assert sidecar(out / "frames" / "000004.txt")["camera_temperature_degC"] == " nan"
     assert sidecar(out / "frames" / "000006.txt")["thermometers.air_degC"] == " nan", "a BAD reading is not passed over"
 
@@ -206,8 +206,8 @@ async def test_a_reading_counts_from_its_own_instant(tmp_path):
         yield frame(time_ns, index)
 
     _, out = await exported(tmp_path, count=1, items=items)
-    told = sidecar(out / "frames" / "000001.txt")
-    assert (told["regulator.pv_degC"], told["regulator.pv_age_s"]) == (" 21.0", " 0.0")
+    reported = sidecar(out / "frames" / "000001.txt")
+    assert (reported["regulator.pv_degC"], reported["regulator.pv_age_s"]) == (" 21.0", " 0.0")
 
 
 async def test_the_index_says_what_the_sidecars_say(tmp_path):
@@ -222,9 +222,9 @@ async def test_a_frame_without_its_description_is_exported_with_what_is_known(tm
     await record(tmp_path / "s", 4, segment_s=1.0)
     (tmp_path / "s" / TELEMETRY / "0001.mcap").unlink()
     export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
-    told = sidecar(tmp_path / "out" / "frames" / "000002.txt")
-    assert told["camera_temperature_degC"] == told["exposure_s"] == " nan"
-    assert (told["block_id"], told["step_id"]) == (" 1", "")
+    reported = sidecar(tmp_path / "out" / "frames" / "000002.txt")
+    assert reported["camera_temperature_degC"] == reported["exposure_s"] == " nan"
+    assert (reported["block_id"], reported["step_id"]) == (" 1", "")
 
 
 async def test_its_readme_says_how_a_text_was_changed_and_what_was_recorded_can_be_had_again(tmp_path):
@@ -279,12 +279,12 @@ async def test_the_descriptions_of_frames_are_a_table_of_their_own(tmp_path):
 
 async def test_progress_rises_to_the_end(tmp_path):
     await record(tmp_path / "s")
-    told = []
-    export(Session.open(tmp_path / "s"), tmp_path / "out", report=lambda done, text: told.append((done, text)))
-    shares = [done for done, _ in told]
+    reported = []
+    export(Session.open(tmp_path / "s"), tmp_path / "out", report=lambda done, text: reported.append((done, text)))
+    shares = [done for done, _ in reported]
     assert shares == sorted(shares)
     assert 0.5 < shares[-1] <= 1.0
-    assert told[-1][1] == "frame 12 of 12"
+    assert reported[-1][1] == "frame 12 of 12"
 
 
 async def test_a_session_that_breaks_off_leaves_nothing(tmp_path):
@@ -294,10 +294,10 @@ async def test_a_session_that_breaks_off_leaves_nothing(tmp_path):
     content = bytearray(damaged.read_bytes())
     content[content.index(b"IDAT") + 20] ^= 1
     damaged.write_bytes(content)
-    told = []
+    reported = []
     with pytest.raises(SessionError, match="damaged"):
-        export(session, tmp_path / "out", report=lambda done, text: told.append(text))
-    assert any(text.startswith("frame") for text in told), "it was on its way"
+        export(session, tmp_path / "out", report=lambda done, text: reported.append(text))
+    assert any(text.startswith("frame") for text in reported), "it was on its way"
     assert [path.name for path in tmp_path.iterdir()] == ["s"]
 
 
@@ -394,16 +394,16 @@ async def test_one_table_has_a_row_for_each_frame(tmp_path, table_format, images
         assert not images or (out / "frames" / "index.csv").exists()
     else:
         assert [row["file"] for row in rows] == table.file.tolist()
-    told = (out / "README.txt").read_text()
-    assert all(name in told for name in ("set_point_degC", "role", "NAME_position_mm", "degrees Celsius"))
+    reported = (out / "README.txt").read_text()
+    assert all(name in reported for name in ("set_point_degC", "role", "NAME_position_mm", "degrees Celsius"))
 
 
 async def test_role_set_point_and_stages_are_those_of_the_step(tmp_path):
     def items(time_ns, index):
-        told = {"role": "reference", "chamber_degC": 15.0 + index, "frames": 1}
+        reported = {"role": "reference", "chamber_degC": 15.0 + index, "frames": 1}
         for item in half_second(time_ns, index):
             yield (
-                StepMark(time_ns, item.step_id, index, item.kind, item.state, told)
+                StepMark(time_ns, item.step_id, index, item.kind, item.state, reported)
                 if isinstance(item, StepMark)
                 else item
             )

@@ -1,4 +1,4 @@
-"""A recording on a disk of 64 MB: what was acknowledged is readable, what was not is told, and telemetry goes on."""
+"""A recording on a disk of 64 MB: what was acknowledged is readable, what was not is reported, telemetry continues."""
 
 import asyncio
 from contextlib import suppress
@@ -59,7 +59,7 @@ class Night:
             self.published += 1
         await self.recorder.flushed()
 
-    def told(self, kind):
+    def reported(self, kind):
         return [event.text for event in self.events if event.kind == kind]
 
 
@@ -105,10 +105,10 @@ async def test_a_full_disk_loses_no_frame_it_has_acknowledged_and_no_telemetry(d
     session = Session.open(disk / "s")
     assert [path.name for path in session.incomplete] == [f"{full.frames // 8:04d}.mcap.part"]
     assert len(session.events()) == len(night.events)
-    assert night.told("note") == [f"second {k}" for k in range(85)]
+    assert night.reported("note") == [f"second {k}" for k in range(85)]
     assert list(lost_blocks(night)) == list(range(full.frames, 80))
-    assert all("No space left on device" in text for text in night.told("frames_dropped"))
-    assert night.told("telemetry_not_saved") == []
+    assert all("No space left on device" in text for text in night.reported("frames_dropped"))
+    assert night.reported("telemetry_not_saved") == []
     assert night.recorder.frames_lost == 80 - full.frames
     kept = [got.block_id for got in session.frames()]
     assert set(kept) | set(readable_blocks(disk / "s")) == set(range(16, full.frames)) | set(range(80, 85))
@@ -132,12 +132,12 @@ async def test_frames_leave_the_end_of_the_disk_to_the_telemetry_and_come_back(d
         ("frames_stopped", "frames are not recorded any more: less than 0.0 GB free on the disk"),
         ("frames_resumed", "frames are recorded again"),
     ):
-        (told,) = night.told(kind)
-        assert told.endswith(text)
+        (reported,) = night.reported(kind)
+        assert reported.endswith(text)
     lost = list(lost_blocks(night))
     assert len(lost) == night.recorder.frames_lost == 45 - night.recorder.saved.frames
     assert lost == list(range(lost[0], lost[-1] + 1))
-    assert all(text.endswith("less than 0.0 GB free on the disk") for text in night.told("frames_dropped"))
+    assert all(text.endswith("less than 0.0 GB free on the disk") for text in night.reported("frames_dropped"))
     assert [got.block_id for got in Session.open(disk / "s").frames()][-5:] == [40, 41, 42, 43, 44]
     assert not Session.open(disk / "s").incomplete
 
@@ -148,4 +148,4 @@ async def test_frames_take_no_more_than_is_left_above_the_threshold(disk):
     async with Night(disk / "s", settings) as night:
         await night.seconds(3)
         assert night.recorder.saved.frames == 3
-    assert night.told("frames_dropped") == []
+    assert night.reported("frames_dropped") == []

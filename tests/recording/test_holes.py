@@ -166,7 +166,7 @@ async def test_steps_are_counted_against_the_plan(tmp_path):
     assert [step.state for step in found.steps].count(StepState.DONE) == SECONDS // 2
 
 
-def test_a_gap_is_told_with_its_times_and_its_frames(session):
+def test_a_gap_is_reported_with_its_times_and_its_frames(session):
     remove(session, TELEMETRY, 1, 2)
     remove(session, FRAMES, 1)
     assert verify(session).files is glance(session).state is Files.INCOMPLETE

@@ -1,4 +1,4 @@
-"""Who holds a lock is told truly, also when the kernel's list of locks leaves it out at times."""
+"""Who holds a lock is found truly, also when the kernel's list of locks leaves it out at times."""
 
 import fcntl
 import os

@@ -97,7 +97,7 @@ async def test_the_overview_has_frames_temperatures_and_events(session):
     assert found.ending.text == "aborted: stopped by the operator"
 
 
-async def test_a_damaged_segment_is_told_and_the_others_are_read(session):
+async def test_a_damaged_segment_is_reported_and_the_others_are_read(session):
     path = session / "telemetry" / "0001.mcap"
     path.write_bytes(path.read_bytes()[:-20])
     assert glance(session).state_text.startswith("damaged: telemetry/0001.mcap: ")

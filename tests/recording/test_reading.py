@@ -138,8 +138,8 @@ def test_a_frame_without_description_comes_in_order_of_time_and_a_description_wi
     write_items(tmp_path, [batch(0), small_frame(1), batch(2), small_frame(3), batch(4)])
     write_images(tmp_path, [small_frame(second) for second in (1, 1.5, 5)])
     session = Session.open(tmp_path)
-    told = [(type(item).__name__, (item.time_ns - START_NS) / NS_PER_S) for item in session.items()]
-    assert told == [
+    reported = [(type(item).__name__, (item.time_ns - START_NS) / NS_PER_S) for item in session.items()]
+    assert reported == [
         ("Batch", 0),
         ("Frame", 1),
         ("UndescribedFrame", 1.5),
@@ -151,7 +151,7 @@ def test_a_frame_without_description_comes_in_order_of_time_and_a_description_wi
     assert [meta.block_id for _, meta in session.frame_metas] == [1, 3]
 
 
-def test_frames_of_one_instant_are_told_apart_by_their_number(tmp_path):
+def test_frames_of_one_instant_are_distinguished_by_their_number(tmp_path):
     write_items(tmp_path, [small_frame(1, 8), batch(1), small_frame(1, 7), batch(2)])
     write_images(tmp_path, [small_frame(1, number) for number in (7, 8, 9)])
     items = list(Session.open(tmp_path).items())
@@ -305,14 +305,14 @@ def attachment_without_end(records):
         (attachment_without_end, r"0000\.mcap: damaged .*OverflowError"),
     ],
 )
-def test_wrong_content_under_right_crcs_is_told(tmp_path, change, sentence):
+def test_wrong_content_under_right_crcs_is_reported(tmp_path, change, sentence):
     write_items(tmp_path, [batch(0, air(20.0, 0)), batch(1, air(21.0, 1))])
     rewrite(tmp_path / TELEMETRY / "0000.mcap", change)
     with pytest.raises(SessionError, match=sentence):
         Session.open(tmp_path).readings("thermometers.air")
 
 
-def test_a_step_nested_deeper_than_python_goes_is_told(tmp_path):
+def test_a_step_nested_deeper_than_python_goes_is_reported(tmp_path):
     step = messages.CLASSES[messages.STEP](state="done", parameters_json="[" * 200_000).SerializeToString()
     write(tmp_path / TELEMETRY, telemetry_topics({}), [[Record(messages.STEP, START_NS, step)]])
     with pytest.raises(SessionError, match="a recorded step cannot be read"):

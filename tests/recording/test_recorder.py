@@ -158,7 +158,7 @@ async def test_a_reader_no_one_here_wrote_decodes_every_message(tmp_path):
         ("/sensors/temperature", "thermostand.Temperatures"): 5,
         ("/chamber/state", "thermostand.ChamberState"): 5,
         ("/table/state", "thermostand.TableState"): 10,
-        ("/table/pose", "foxglove.PoseInFrame"): 9,  # none before both axes have told where they are
+        ("/table/pose", "foxglove.PoseInFrame"): 9,  # none before both axes have shown where they are
         ("/flap/state", "thermostand.FlapState"): 5,
         ("/experiment/step", "thermostand.Step"): 5,
         ("/experiment/event", "thermostand.Event"): 5,
@@ -191,7 +191,7 @@ async def test_raw_frames_are_read_back(tmp_path):
     np.testing.assert_array_equal(images[1], frame(0, 1).image)
 
 
-async def test_frames_beyond_the_queue_are_dropped_counted_and_told(tmp_path):
+async def test_frames_beyond_the_queue_are_dropped_counted_and_reported(tmp_path):
     def burst(time_ns, index):
         for block_id in range(30 if index == 0 else 0):
             yield frame(time_ns + block_id, block_id)
@@ -242,14 +242,14 @@ async def test_telemetry_waits_in_memory_while_the_disk_takes_nothing(tmp_path, 
     assert sorted(path.name for path in (tmp_path / "s" / "telemetry").iterdir()) == ["0000.mcap.part", "0001.mcap"]
 
 
-async def test_a_frame_the_disk_refuses_is_told_and_telemetry_goes_on(tmp_path, files_limited):
+async def test_a_frame_the_disk_refuses_is_reported_and_telemetry_goes_on(tmp_path, files_limited):
     def items(time_ns, index):
         yield frame(time_ns, index, (200, 200) if index == 1 else (8, 8))
         yield from notes(time_ns, index)
 
     events = await record(tmp_path / "s", 4, items=items, between=files_limited(30_000, range(4)))
-    (told,) = [event.text for event in events if event.kind == "frames_dropped"]
-    assert told.startswith("frames lost: 1 (block 1 of step capture-1), 1 in all; [Errno 27]")
+    (reported,) = [event.text for event in events if event.kind == "frames_dropped"]
+    assert reported.startswith("frames lost: 1 (block 1 of step capture-1), 1 in all; [Errno 27]")
     session = Session.open(tmp_path / "s")
     assert len([event for event in session.events() if event.kind == "note"]) == 4
     assert [got.block_id for got in session.frames()] == [2, 3]  # block 0 waits in the part that was given up
@@ -418,7 +418,7 @@ def test_every_lost_block_is_named(blocks, text):
     assert ranges(blocks) == text
 
 
-def test_losses_are_told_by_reason_and_step():
+def test_losses_are_reported_by_reason_and_step():
     losses = Losses()
     for block_id, step_id, reason in [(1, "a", "slow"), (2, "a", "slow"), (4, "b", "slow"), (5, "", "full")]:
         losses.count(replace(frame(START_NS, block_id), step_id=step_id), reason)

@@ -115,16 +115,16 @@ def test_without_windows_frames_are_whole_and_the_search_waits_for_its_turn():
     assert whole(encoder, [frame(s) for s in (59, 60, 61)]) == [True, True, False]
 
 
-def test_a_search_that_failed_leaves_the_frames_whole_and_is_told_and_repeated():
+def test_a_search_that_failed_leaves_the_frames_whole_and_is_reported_and_repeated():
     def fail(_):
         raise RuntimeError("no luck")
 
-    encoder, told = RoiEncoder(fail), []
-    encoder.tell = told.append
+    encoder, reported = RoiEncoder(fail), []
+    encoder.tell = reported.append
     assert whole(encoder, [frame(second) for second in (0, 1, 59)]) == [True] * 3
-    assert told == ["frames are recorded whole: the search for markers failed (RuntimeError: no luck)"]
+    assert reported == ["frames are recorded whole: the search for markers failed (RuntimeError: no luck)"]
     encoder(frame(60))
-    assert len(told) == 2
+    assert len(reported) == 2
 
 
 @pytest.mark.parametrize("window", [[0, 0, 101, 5], [-1, 0, 5, 5], [5, 5, 0, 5]])

@@ -151,7 +151,7 @@ def test_a_file_under_a_number_far_outside_does_not_count(tmp_path):
 
 
 def test_no_next_segment_is_begun_while_a_refused_block_may_still_be_in_the_last_one(tmp_path, limited):
-    """An append-only file cannot be made shorter, whoever asks."""
+    """An append-only file cannot be made shorter, no matter who asks."""
     with ext4(tmp_path / "disk", 16 << 20) as disk:
         folder = disk / "s"
         folder.mkdir()
@@ -174,7 +174,7 @@ def test_no_next_segment_is_begun_while_a_refused_block_may_still_be_in_the_last
         assert [text.startswith("a segment of telemetry was given up") for text in series.troubles] == [True]
 
 
-def test_a_folder_that_was_removed_is_made_anew_only_when_told_and_its_numbers_go_on(tmp_path):
+def test_a_folder_that_was_removed_is_made_again_only_when_asked_and_its_numbers_continue(tmp_path):
     folder = tmp_path / "s"
     series = Series(folder, form())
     for commit in range(2):

@@ -138,7 +138,7 @@ def test_a_file_that_was_removed_takes_nothing_more(tmp_path):
 
 
 def test_a_torn_block_that_cannot_be_cut_off_yet_is_cut_off_later(tmp_path, limited):
-    """An append-only file cannot be made shorter, whoever asks."""
+    """An append-only file cannot be made shorter, no matter who asks."""
     with ext4(tmp_path / "disk", 16 << 20) as folder:
         sink = CommitSink(folder / "file")
         sink.append([b"a" * 1000])

@@ -68,7 +68,7 @@ def soak(time_ns, index):
         yield StepMark(time_ns, "cycle/soak-30", 7, "Soak", state, {"dwell_s": 1.5})
 
 
-async def test_the_step_under_way_is_told_again_at_the_start(tmp_path):
+async def test_the_step_under_way_is_shown_again_at_the_start(tmp_path):
     await record(tmp_path / "s", 8, items=soak)
     session = Session.open(tmp_path / "s")
     begin_ns = START_NS + 3 * HALF_NS

@@ -179,7 +179,7 @@ async def test_a_cut_segment_is_damaged(session):
     assert errors(session) == ["error: telemetry/0001.mcap: is damaged: it ends in the middle"]
 
 
-async def test_what_a_recorder_or_a_salvage_left_is_told(session):
+async def test_what_a_recorder_or_a_salvage_left_is_reported(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0007.mcap.part")
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.mcap.damaged")
     found = errors(session)
@@ -291,14 +291,14 @@ async def test_a_session_that_is_being_recorded_has_no_error_at_any_time(tmp_pat
     assert verify(tmp_path / "s").findings == ()
 
 
-async def test_a_session_without_telemetry_is_told_so(session):
+async def test_a_session_without_telemetry_is_reported(session):
     shutil.rmtree(session / "telemetry")
     missing, frames = errors(session)
     assert missing == "error: telemetry: is missing"
     assert frames.startswith("error: 12 frames are without a description in the telemetry: blocks 100 to 111")
 
 
-async def test_a_segment_of_another_place_is_told(session):
+async def test_a_segment_of_another_place_is_reported(session):
     shutil.copy(session / "frames" / "0001.mcap", session / "frames" / "0002.mcap")
     assert "error: frames/0002.mcap: records another place in the session than its name" in errors(session)
 
@@ -384,7 +384,7 @@ def test_a_folder_without_segments_is_no_session(tmp_path):
         verify(tmp_path)
 
 
-async def test_a_segment_of_another_session_is_told(session, tmp_path):
+async def test_a_segment_of_another_session_is_reported(session, tmp_path):
     other = await recorded(tmp_path / "other")
     data = (other / "frames" / "0001.mcap").read_bytes().replace(b"night-1", b"night-2")
     (session / "frames" / "0001.mcap").write_bytes(data)

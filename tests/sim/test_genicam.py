@@ -110,7 +110,7 @@ def test_a_write_tells_what_changed_and_reset_undoes_it(registers: Registers) ->
     assert registers.integer("Width") == 64
 
 
-def test_a_command_is_told_every_time_and_reads_zero(registers: Registers) -> None:
+def test_a_command_is_reported_every_time_and_reads_zero(registers: Registers) -> None:
     assert write(registers, "AcquisitionStart", 1) == ("AcquisitionStart",)
     assert write(registers, "AcquisitionStart", 1) == ("AcquisitionStart",)
     assert registers.read(BY_NAME["AcquisitionStart"].address, 4) == bytes(4)

@@ -139,7 +139,7 @@ def test_it_homes_and_moves_the_stage(axis: Any) -> None:
     assert (position.Position, position.uPosition) == (0, 0)
 
 
-def test_it_is_told_of_a_corrected_value(axis: Any) -> None:
+def test_it_learns_of_a_corrected_value(axis: Any) -> None:
     move = axis.get_move_settings()
     move.Accel = 0
     with pytest.raises(ValueError, match="rejected"):

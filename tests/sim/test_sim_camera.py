@@ -529,7 +529,7 @@ def test_arv_tool_reads_and_sets_features(arv_tool: str) -> None:
     ]
 
 
-def test_arv_tool_is_told_why_a_value_is_refused(arv_tool: str) -> None:
+def test_arv_tool_learns_why_a_value_is_refused(arv_tool: str) -> None:
     assert "invalid-parameter" in run(arv_tool, "control", "Gain=99")
 
 

@@ -355,7 +355,7 @@ def test_zero_at_rest_makes_the_stored_target_zero(linear: Bench) -> None:
     assert linear.settle().steps == 10
 
 
-def test_spos_sets_count_and_encoder_unless_told_to_leave_them(linear: Bench) -> None:
+def test_spos_sets_count_and_encoder_unless_asked_to_leave_them(linear: Bench) -> None:
     linear.ask("spos", struct.pack("<ihqB5x", 100, 64, 7, 0))
     assert struct.unpack("<ihq6x", linear.ask("gpos", size=26)) == (100, 64, 7)
     linear.ask("spos", struct.pack("<ihqB5x", 1, 1, 1, 3))

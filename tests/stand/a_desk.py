@@ -77,7 +77,7 @@ class ADesk:
 
     def tell(self, text: str, **data: object) -> None:
         """An event."""
-        self.hub.publish(Event(self.clock.now_ns(), "info", "told", text, data))
+        self.hub.publish(Event(self.clock.now_ns(), "info", "reported", text, data))
 
     def state(self) -> StandState:
         return StandState(

@@ -1,4 +1,4 @@
-"""A local HTTP receiver of alerts: it notes what is posted and called, and hangs when it is told to."""
+"""A local HTTP receiver of alerts: it notes what is posted and called, and hangs when it is asked to."""
 
 import json
 import threading

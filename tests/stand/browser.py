@@ -19,7 +19,7 @@ ARGUMENTS = (
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 )
 DESKTOP, PHONE = (1440, 980), (390, 844)
-# A broken connection and a request that the stand refuses are told on the page, and by chromium in its console.
+# A broken connection and a request that the stand refuses are shown on the page, and by chromium in its console.
 _EXPECTED = ("Failed to load resource", "WebSocket connection to")
 
 

@@ -184,7 +184,7 @@ def event(kind: str, text: str, data_json: str) -> tuple[str, bytes]:
     return messages.EVENT, made.SerializeToString()
 
 
-def told(*events: tuple[str, bytes]) -> Callable[[Path], None]:
+def reported(*events: tuple[str, bytes]) -> Callable[[Path], None]:
     """A session with events behind the others of its first segment."""
     return lambda session: rewritten(telemetry(session, 0), behind=events)
 
@@ -325,7 +325,7 @@ ROWS: dict[str, Row] = {
     "a journal of 9 MB": Row(
         lambda s: journal(s, *[b'{"entry": "Cleared", "time_ns": 1}'] * 200_000), SOUND, nightly=True
     ),
-    # what is attached and told
+    # what is attached and stated
     "a configuration of aliases": Row(configured(aliases()), SOUND),
     "a configuration of merge keys": Row(configured(merges(12)), SOUND),
     "a configuration of 60,000 keys": Row(
@@ -334,11 +334,13 @@ ROWS: dict[str, Row] = {
     "a deep configuration": Row(configured(DEEP.encode()), SOUND),
     "a configuration that is not UTF-8": Row(configured(b"name: \xff\xfe\n"), SOUND),
     "a configuration that is code": Row(configured(b"name: !!python/object/apply:os.system ['true']\n"), SOUND),
-    "a deep event": Row(told(event("note", "deep", DEEP)), DAMAGED),
-    "an event of huge numbers": Row(told(event("note", "huge", '{"x": %s}' % ("9" * 5000))), DAMAGED),
-    "an event of no numbers": Row(told(event("clock_step", "none", '{"offset_ns": NaN, "time_ns": Infinity}')), SOUND),
+    "a deep event": Row(reported(event("note", "deep", DEEP)), DAMAGED),
+    "an event of huge numbers": Row(reported(event("note", "huge", '{"x": %s}' % ("9" * 5000))), DAMAGED),
+    "an event of no numbers": Row(
+        reported(event("clock_step", "none", '{"offset_ns": NaN, "time_ns": Infinity}')), SOUND
+    ),
     "events of wrong types": Row(
-        told(
+        reported(
             *(
                 event(kind, "x", json.dumps({"status": [], "steps": {}, "blocks": "x", "offset_ns": "x"}))
                 for kind in ("run.start", "run.end", "frames_dropped", "clock_step", "gap", "interrupted")
@@ -346,9 +348,9 @@ ROWS: dict[str, Row] = {
         ),
         SOUND,
     ),
-    "an event for a spreadsheet and a terminal": Row(told(event("note", FORMULA, "")), SOUND),
-    "a step of wrong types": Row(told(step('{"duration_s": "x", "frames": -1}', index=2_000_000_000)), SOUND),
-    "a step that is no JSON": Row(told(step("{")), DAMAGED),
+    "an event for a spreadsheet and a terminal": Row(reported(event("note", FORMULA, "")), SOUND),
+    "a step of wrong types": Row(reported(step('{"duration_s": "x", "frames": -1}', index=2_000_000_000)), SOUND),
+    "a step that is no JSON": Row(reported(step("{")), DAMAGED),
     # images
     "a picture of 256 megapixels": Row(imaged(lambda: black(16_000, 16_000)), SOUND),
     "a picture of 4 million megapixels": Row(imaged(lambda: png(2_000_000, 2_000_000, b"x")), SOUND),

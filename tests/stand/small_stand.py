@@ -196,17 +196,17 @@ class Life:
         self.stand.safety.demand()
 
     async def _begin(self, folder):
-        first, told = (), ()
+        first, reported = (), ()
         if self._resumes:
             self._journal, entries = Journal.open(folder)
             frames = [(item.time_ns, item.step_id) for item in self._disk if isinstance(item, Frame)]
             captures = {planned.step_id for planned in self._plan if isinstance(planned.step, Capture)}
-            told = with_recorded(entries, self._disk, [frame for frame in frames if frame[1] in captures])
+            reported = with_recorded(entries, self._disk, [frame for frame in frames if frame[1] in captures])
             last_ns = max([item.time_ns for item in self._disk] + [entry.time_ns for entry in entries], default=0)
             first = (Gap(last_ns, self.clock.now_ns()),)
         else:
             self._journal = Journal.create(folder)
-        self.log = Logbook(self.hub, self.clock, fold(self._plan, told))
+        self.log = Logbook(self.hub, self.clock, fold(self._plan, reported))
         self._time = asyncio.create_task(self.clock.run())
         await self.log.begin(self._journal, *first)
         self.stand.gate.subscribe(self.log.held)

@@ -45,7 +45,7 @@ def recipe(entry: str) -> Recipe:
 
 
 @pytest.mark.usefixtures("staircase")
-def test_the_example_is_planned_as_those_of_the_house_are():
+def test_the_example_is_planned_as_the_installed_ones_are():
     steps = [planned.step for planned in recipe("staircase: {stairs: 2, stair_K: 5}").plan()]
     assert [step.chamber_degC for step in steps if isinstance(step, SetTemperature)] == [29.0, 24.0, 34.0, 24.0]
     assert sum(isinstance(step, Capture) for step in steps) == 5

@@ -1,4 +1,4 @@
-"""What is told of a night's events: each cause once, when it has lasted, and once more when it is over."""
+"""What is sent of a night's events: each cause once, when it has lasted, and once more when it is over."""
 
 import pytest
 
@@ -20,7 +20,7 @@ def book(**changes):
     return AlertBook(**{"name": "lab", "causes": CAUSES, "grace_ns": 60 * NS_PER_S, "most_per_h": 20, **changes})
 
 
-def told(found, *events, until_s=0):
+def reported(found, *events, until_s=0):
     """(title, text) of all messages of these events, and of those that are due second by second up to then."""
     messages = []
     for each in events:
@@ -58,39 +58,42 @@ def test_what_an_event_means(kind, data, cause, phase):
     assert (cause, phase) == (None, None) if sign is None else (sign.cause, sign.phase) == (cause, phase)
 
 
-def test_a_prompt_that_nobody_is_there_for_is_not_told():
+def test_a_prompt_that_nobody_is_there_for_is_not_reported():
     assert sign_of(event("prompt", level="info")) is None
 
 
-def test_what_is_over_within_the_grace_time_is_not_told():
+def test_what_is_over_within_the_grace_time_is_not_reported():
     found = book()
     assert (
-        told(found, event("device_lost", 0, device="flap"), event("device_back", 59, device="flap"), until_s=300) == []
+        reported(found, event("device_lost", 0, device="flap"), event("device_back", 59, device="flap"), until_s=300)
+        == []
     )
 
 
-def test_what_lasts_is_told_once_and_when_it_is_over():
+def test_what_lasts_is_reported_once_and_when_it_is_over():
     found = book()
     lost = [event("device_lost", second, device="flap") for second in (0, 70, 80)]
-    assert told(found, *lost, until_s=200) == [("a device is lost", "why")]
+    assert reported(found, *lost, until_s=200) == [("a device is lost", "why")]
     assert not found.is_well
-    assert told(found, event("device_back", 300, text="answers", device="flap")) == [
+    assert reported(found, event("device_back", 300, text="answers", device="flap")) == [
         ("ok again", "answers (it was: why)")
     ]
     assert found.is_well
-    assert told(found, event("device_lost", 400, device="flap"), until_s=500) == [("a device is lost", "why")]
+    assert reported(found, event("device_lost", 400, device="flap"), until_s=500) == [("a device is lost", "why")]
 
 
 def test_two_devices_are_two_causes():
     found = book(grace_ns=0)
-    assert len(told(found, event("device_lost", 0, device="a"), event("device_lost", 0, device="b"), until_s=1)) == 2
+    assert (
+        len(reported(found, event("device_lost", 0, device="a"), event("device_lost", 0, device="b"), until_s=1)) == 2
+    )
 
 
-def test_a_trip_and_the_end_it_makes_are_told_at_once():
+def test_a_trip_and_the_end_it_makes_are_reported_at_once():
     found = book()
     trip = event("guard.over_temperature", 1, "error", "air is hot", action="abort")
     end = event("run.end", 2, "error", "aborted: air is hot", status="tripped")
-    assert told(found, trip, trip, end, until_s=300) == [
+    assert reported(found, trip, trip, end, until_s=300) == [
         ("TRIPPED", "air is hot"),
         ("a run has ended before its plan was done", "aborted: air is hot"),
     ]
@@ -99,25 +102,25 @@ def test_a_trip_and_the_end_it_makes_are_told_at_once():
 def test_a_hold_that_an_operator_cleared_is_over():
     found = book()
     hold = event("guard.device_fault", 0, "error", "set-point changed", action="hold")
-    assert told(found, hold, until_s=60) == [("held", "set-point changed")]
-    assert [title for title, _ in told(found, event("released", 90, reason="interlock"))] == ["ok again"]
+    assert reported(found, hold, until_s=60) == [("held", "set-point changed")]
+    assert [title for title, _ in reported(found, event("released", 90, reason="interlock"))] == ["ok again"]
 
 
-def test_a_run_that_fails_before_it_begins_is_told_and_one_that_ended_not_twice():
+def test_a_run_that_fails_before_it_begins_is_reported_and_one_that_ended_not_twice():
     found = book()
-    assert len(told(found, event("run_failed", 0))) == 1
-    assert len(told(found, event("run.end", 1, status="failed"), event("run_failed", 1))) == 1
+    assert len(reported(found, event("run_failed", 0))) == 1
+    assert len(reported(found, event("run.end", 1, status="failed"), event("run_failed", 1))) == 1
 
 
-def test_in_an_hour_only_so_many_are_told_but_every_trip():
+def test_in_an_hour_only_so_many_are_sent_but_every_trip():
     found = book(most_per_h=3, grace_ns=0)
     prompts = [event("prompt", second, text=str(second)) for second in range(10)]
-    assert [text for _, text in told(found, *prompts)] == ["0", "1", "2"]
+    assert [text for _, text in reported(found, *prompts)] == ["0", "1", "2"]
     trip = event("guard.over_temperature", 20, action="abort")
-    assert told(found, trip) == [("TRIPPED", "why\n7 messages before this one were left out")]
-    assert [text for _, text in told(found, event("prompt", 3700, text="later"))] == ["later"]
+    assert reported(found, trip) == [("TRIPPED", "why\n7 messages before this one were left out")]
+    assert [text for _, text in reported(found, event("prompt", 3700, text="later"))] == ["later"]
 
 
-def test_only_what_is_wanted_is_told():
+def test_only_what_is_wanted_is_reported():
     found = book(causes=("trip",))
-    assert told(found, event("run.start", 0), event("guard.x", 1, action="abort")) == [("TRIPPED", "why")]
+    assert reported(found, event("run.start", 0), event("guard.x", 1, action="abort")) == [("TRIPPED", "why")]

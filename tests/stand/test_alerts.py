@@ -52,7 +52,7 @@ async def test_an_event_becomes_a_message_and_life_is_signalled(receiver, tmp_pa
         publish(hub, clock, "run.end", "error", "aborted", status="tripped")  # what is open is over with the run
         await reached(lambda: len(receiver.calls) >= 2)
         publish(hub, clock, "run.start", "info", "recipe demo")
-    assert receiver.messages[-1] == ("lab: a run has begun", "recipe demo")  # told at the end at the latest
+    assert receiver.messages[-1] == ("lab: a run has begun", "recipe demo")  # sent at the end at the latest
     assert set(receiver.calls) == {"/alive/TOKEN"}
 
 
@@ -82,12 +82,12 @@ async def test_a_receiver_that_hangs_delays_nothing(receiver, tmp_path: Path, mo
             publish(hub, clock, "guard.x", "error", str(number), action="abort")
             longest_s = max(longest_s, time.monotonic() - before_s)
         ending_s = time.monotonic()
-    assert longest_s < 1.0  # microseconds, and one is put in a queue while the others are told
+    assert longest_s < 1.0  # microseconds, and one is put in a queue while the others are sent
     assert time.monotonic() - ending_s < 20.0
     assert receiver.messages == []
 
 
-async def test_what_a_receiver_refused_is_sent_again_and_told_once_without_its_address(
+async def test_what_a_receiver_refused_is_sent_again_and_reported_once_without_its_address(
     receiver, tmp_path: Path, monkeypatch
 ):
     monkeypatch.setattr(module, "_AGAIN_S", (0.1,) * 50)
@@ -128,7 +128,7 @@ async def test_who_has_a_message_does_not_get_it_again_because_another_receiver_
     assert len(receiver.messages) == 1
 
 
-async def test_a_run_that_fails_before_it_begins_is_told(receiver, tmp_path: Path):
+async def test_a_run_that_fails_before_it_begins_is_reported(receiver, tmp_path: Path):
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml"))
     with pytest.raises(ConfigError):
         async with alerting("lab", config, Hub(), WallClock()):
@@ -188,7 +188,7 @@ def test_secrets_that_others_may_read_are_refused(tmp_path: Path, mode: int):
 
 
 @pytest.mark.parametrize("text", ["urls: TOKEN", "TOKEN: [", "alive_url: TOKEN", "\x00", "urls: [1]"])
-def test_what_is_wrong_in_the_secrets_is_told_without_them(tmp_path: Path, text: str):
+def test_what_is_wrong_in_the_secrets_is_reported_without_them(tmp_path: Path, text: str):
     path = tmp_path / "s.yaml"
     path.write_text(text)
     path.chmod(0o600)
@@ -233,7 +233,7 @@ def test_alert_test_tells_who_was_reached(receiver, tmp_path: Path):
     assert "has no alerts.secrets" in result.stderr
 
 
-async def test_a_run_whose_stand_does_not_answer_is_told(receiver, tmp_path: Path):
+async def test_a_run_whose_stand_does_not_answer_is_reported(receiver, tmp_path: Path):
     path = config_with(tmp_path, receiver.secrets(tmp_path / "s.yaml"))
     order = load_order("demo", str(path))
     with pytest.raises(DeviceError):

@@ -90,7 +90,7 @@ async def test_the_wait_ends_at_its_limit_and_says_that_the_camera_is_still_warm
     assert "continuing outside 0.5 K" in room.events[0].text
 
 
-async def test_a_camera_that_told_no_temperature_is_given_all_the_time(room: Room) -> None:
+async def test_a_camera_that_showed_no_temperature_is_given_all_the_time(room: Room) -> None:
     await cool_down(None, BAND_K, TIME_CONSTANT_S, 7200.0, room.hub, room.clock)
     assert room.waited_s == pytest.approx(7200.0)
     assert [(event.level, event.kind) for event in room.events] == [("warning", "cool_down_unsure")]

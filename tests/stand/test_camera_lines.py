@@ -73,7 +73,7 @@ def test_the_check_shows_what_each_camera_needs_of_a_shared_line():
     assert (slow.verdict, bool(slow.advice)) == ("failed", True)
 
 
-def test_each_camera_is_told_how_many_share_its_line():
+def test_each_camera_learns_how_many_share_its_line():
     cameras = assemble(of(3), Hub(), WallClock()).devices.cameras.values()
     assert [camera.settings.line_shared_by for camera in cameras if isinstance(camera, Camera)] == [3, 3, 3]
     own = assemble(of(2, line_shared_by=1), Hub(), WallClock()).devices.cameras["camera"]

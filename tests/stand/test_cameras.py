@@ -84,7 +84,7 @@ async def test_when_one_is_lost_there_is_a_frame_of_none_until_all_are_open_agai
     assert (one.opened, other.opened) == (1, 1)
 
 
-async def test_whichever_has_started_anew_is_told(pair: tuple[Camera, Camera, Cameras]):
+async def test_whichever_has_restarted_is_reported(pair: tuple[Camera, Camera, Cameras]):
     one, other, cameras = pair
     assert cameras.restarted == ""
     one.restarted, other.restarted = "one", "other"

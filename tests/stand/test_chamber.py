@@ -137,7 +137,7 @@ async def test_a_set_point_on_its_way_goes_no_further_when_the_stand_trips():
         assert max(set_points(here.calls)) <= 25.5
 
 
-async def test_permits_that_are_not_renewed_are_told_once_for_each_reason():
+async def test_permits_that_are_not_renewed_are_reported_once_for_each_reason():
     async with rooms() as here:
         keeper, clock = here.stand.chamber.keeper, here.clock
         here.stand.chamber.permits.grant()

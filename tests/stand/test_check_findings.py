@@ -45,5 +45,5 @@ def test_the_newest_picture_of_an_imager_is_looked_at(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("packet_size", "verdict"), [(8000, "ok"), (65_600, "failed")])
-def test_packets_larger_than_the_interface_takes_are_told(packet_size: int, verdict: str):
+def test_packets_larger_than_the_interface_takes_are_reported(packet_size: int, verdict: str):
     assert packet_finding("camera", "127.0.0.9", packet_size).verdict == verdict

@@ -25,7 +25,7 @@ class Watched:
             self.host.awake_ns += NS_PER_S
             self._watch.look()
 
-    def told(self) -> list[tuple[str, object, object]]:
+    def reported(self) -> list[tuple[str, object, object]]:
         return [(e.level, e.data["offset_before_ns"], e.data["offset_after_ns"]) for e in self.events]
 
 
@@ -58,7 +58,7 @@ def test_a_step_is_recorded_with_both_offsets_and_both_instants():
     )
     watched.host.step(-3600)
     watched.passes(2)
-    assert watched.told()[1:] == [("warning", seconds_ns(3600), 0)]
+    assert watched.reported()[1:] == [("warning", seconds_ns(3600), 0)]
 
 
 def test_slow_drift_is_recorded_each_time_it_has_come_to_more_than_a_second():
@@ -66,7 +66,7 @@ def test_slow_drift_is_recorded_each_time_it_has_come_to_more_than_a_second():
     for _ in range(5000):
         watched.host.step(500e-6)  # as fast as NTP slews
         watched.passes(1)
-    warnings = [each for each in watched.told() if each[0] == "warning"]
+    warnings = [each for each in watched.reported() if each[0] == "warning"]
     assert warnings == [("warning", seconds_ns(1.0005) * n, seconds_ns(1.0005) * (n + 1)) for n in range(2)]
 
 
@@ -74,16 +74,16 @@ def test_an_offset_is_repeated_so_that_each_segment_knows_it():
     watched = Watched()
     watched.host.step(-5)
     watched.passes(650)
-    assert watched.told() == [("warning", 0, seconds_ns(-5))] + [("info", seconds_ns(-5), seconds_ns(-5))] * 2
+    assert watched.reported() == [("warning", 0, seconds_ns(-5))] + [("info", seconds_ns(-5), seconds_ns(-5))] * 2
 
 
 def test_a_run_that_goes_on_records_at_once_what_differs_from_the_session():
     assert Watched().events == []
-    assert Watched(recorded_s=3600).told() == [("warning", seconds_ns(3600), 0)]
+    assert Watched(recorded_s=3600).reported() == [("warning", seconds_ns(3600), 0)]
     ahead = Watched(no_earlier_than_ns=Host().utc_ns() + seconds_ns(7200))
-    assert ahead.told() == [("warning", 0, seconds_ns(-7200))]
+    assert ahead.reported() == [("warning", 0, seconds_ns(-7200))]
     still = Watched(-7200, Host().utc_ns() + seconds_ns(7200))
-    assert still.told() == [("info", seconds_ns(-7200), seconds_ns(-7200))]
+    assert still.reported() == [("info", seconds_ns(-7200), seconds_ns(-7200))]
 
 
 def test_a_suspend_is_an_event_with_its_length_and_no_step():
@@ -105,8 +105,8 @@ def step_event(time_s: float, before_s: float, after_s: float) -> Event:
 
 def test_the_offset_that_held_at_an_instant_makes_it_utc():
     utc = offsets_of([step_event(200, 3600, -10), step_event(100, 5, 3600), Event(150, "info", "other", "")])
-    told = [(time_s, utc.at(seconds_ns(time_s)) // NS_PER_S) for time_s in (0, 99.9, 100, 199.9, 200, 1e6)]
-    assert told == [(0, 5), (99.9, 5), (100, 3600), (199.9, 3600), (200, -10), (1e6, -10)]
+    reported = [(time_s, utc.at(seconds_ns(time_s)) // NS_PER_S) for time_s in (0, 99.9, 100, 199.9, 200, 1e6)]
+    assert reported == [(0, 5), (99.9, 5), (100, 3600), (199.9, 3600), (200, -10), (1e6, -10)]
     assert utc.date_time(seconds_ns(100)) == "1970-01-01 01:01:40"
     assert utc.utc_text(seconds_ns(99)) == "1970-01-01T00:01:44.000000000Z"
     assert UtcOffsets().utc_ns(77) == 77

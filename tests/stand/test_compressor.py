@@ -165,7 +165,7 @@ def test_without_a_file_nothing_is_kept():
     assert restored(None, NOW_NS, BOOT) == CompressorState(False, NOW_NS)
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path):
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OSError, match="file"):
         keep(tmp_path / "file" / "compressor.json", CompressorState(False, 5), BOOT)

@@ -60,7 +60,7 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
     path = session(tmp_path, "night")
     async with served(ADesk(run=STATUS), path):
         lines = (await invoke("status", tmp_path)).stdout.splitlines()
-        told = json.loads((await invoke("status", path, "--json")).stdout)
+        reported = json.loads((await invoke("status", path, "--json")).stdout)
     assert lines == [
         f"session       {path}",
         "recipe        thermal-cycle",
@@ -75,7 +75,7 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
         "next          it continues when there is room: `stand session archive` copies what is finished elsewhere",
         "next          `stand continue` ends the pause",
     ]
-    assert RunStatus.model_validate(told) == STATUS.model_copy(update={"session": str(path)})
+    assert RunStatus.model_validate(reported) == STATUS.model_copy(update={"session": str(path)})
 
 
 def test_status_tells_utc_when_the_system_clock_was_stepped_after_the_present_state_began():
@@ -99,8 +99,8 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
     host.step(3600)
     board(Event(clock.now_ns(), "warning", "odd", "it is so"))
     host.step(-60)
-    told = board.status()
-    offsets_ns = (told.since_utc_offset_ns, told.warning_utc_offset_ns, told.utc_offset_ns)
+    reported = board.status()
+    offsets_ns = (reported.since_utc_offset_ns, reported.warning_utc_offset_ns, reported.utc_offset_ns)
     assert offsets_ns == (0, 3600 * NS_PER_S, 3540 * NS_PER_S)
 
 

@@ -88,7 +88,7 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
         yield found
 
 
-def test_the_service_manager_is_told_in_lines(manager: socket.socket, monkeypatch: pytest.MonkeyPatch):
+def test_the_service_manager_is_notified_in_lines(manager: socket.socket, monkeypatch: pytest.MonkeyPatch):
     systemd.tell(systemd.READY, "STATUS=idle")
     assert manager.recv(1000) == b"READY=1\nSTATUS=idle"
     systemd.tell(systemd.extended(60.0))
@@ -99,23 +99,23 @@ def test_the_service_manager_is_told_in_lines(manager: socket.socket, monkeypatc
     assert systemd.watchdog_s() is None
 
 
-def test_without_a_service_manager_nobody_is_told(monkeypatch: pytest.MonkeyPatch):
+def test_without_a_service_manager_nobody_is_notified(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)
     systemd.tell(systemd.READY)
     assert systemd.watchdog_s() is None
 
 
-async def test_a_run_that_cannot_be_reported_is_told_and_the_next_has_its_turn(tmp_path: Path):
-    hub, told = Hub(), list[str]()
-    hub.subscribe(lambda item: told.append(f"{item.kind}: {item.text}") if isinstance(item, Event) else None)
+async def test_a_run_whose_report_fails_is_an_event_and_the_next_has_its_turn(tmp_path: Path):
+    hub, reported = Hub(), list[str]()
+    hub.subscribe(lambda item: reported.append(f"{item.kind}: {item.text}") if isinstance(item, Event) else None)
     reports = Reports(hub, WallClock())
     reports.add(tmp_path / "first")
     reports.add(tmp_path / "second")
     async with asyncio.timeout(60):
-        while not told:
+        while not reported:
             await asyncio.sleep(0.05)
     await reports.close()  # the second one is given up
-    (line,) = told
+    (line,) = reported
     assert line.startswith(f"not_reported: {tmp_path / 'first'} is recorded, but not reported: ")
     assert f"`compensate report {tmp_path / 'first'} -o report.html` tries again" in line

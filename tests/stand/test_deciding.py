@@ -52,8 +52,8 @@ def life(tmp_path: Path):
         if answers:
             (tmp_path / ANSWERS).write_text(json.dumps(answers))
         begun = Life(tmp_path, PLAN, start_ns, disk, 24.0, "tests.stand.decisions_process")
-        begun.told = []
-        begun.hub.subscribe(begun.told.append)
+        begun.reported = []
+        begun.hub.subscribe(begun.reported.append)
         lives.append(begun)
         return begun
 
@@ -75,10 +75,10 @@ def test_visits_are_decided_until_enough_is_known(life: Callable[..., Life], tmp
     here = life(visit(47.0, 120.0), visit(12.0, 60.0), visit(33.0, 60.0), ENOUGH)
     here.passes(1500.0)
     assert here.run.done()
-    assert not [item.text for item in here.told if isinstance(item, Event) and item.kind == "undecided"]
+    assert not [item.text for item in here.reported if isinstance(item, Event) and item.kind == "undecided"]
     fit = [(47.0, Role.FIT), (12.0, Role.FIT), (33.0, Role.FIT)]
     assert captured(here.log.state.plan) == [(24.0, Role.REFERENCE), *fit, (40.0, Role.VALIDATION)]
-    assert sum(isinstance(item, Frame) for item in here.told) == 20 + 4
+    assert sum(isinstance(item, Frame) for item in here.reported) == 20 + 4
     entries, _ = read_lines((tmp_path / JOURNAL_NAME).read_bytes())
     decisions = [entry for entry in entries if isinstance(entry, Edited)]
     assert [each.reason for each in decisions] == ["it teaches most"] * 3 + ["known to 4 mpx"]
@@ -107,7 +107,7 @@ def test_a_fit_whose_process_is_killed_is_made_again(life: Callable[..., Life], 
     here = life("die", visit(47.0, 120.0), visit(12.0, 60.0), "die", visit(33.0, 60.0), ENOUGH)
     here.passes(1500.0)
     assert here.run.done()
-    assert not [item for item in here.told if isinstance(item, Event) and item.kind == "undecided"]
+    assert not [item for item in here.reported if isinstance(item, Event) and item.kind == "undecided"]
     assert [degC for degC, _ in captured(here.log.state.plan)] == [24.0, 47.0, 12.0, 33.0, 40.0]
     asked = (tmp_path / ASKED).read_text().splitlines()
     assert (asked[0], asked[3]) == (asked[1], asked[4])
@@ -138,7 +138,7 @@ def test_without_decisions_the_fixed_plan_goes_on_and_it_is_said(life: Callable[
     here.passes(8 * 700.0)
     assert here.run.done()
     assert [degC for degC, _ in captured(here.log.state.plan)] == [24.0, 47.0, *CYCLE.set_points_degC]
-    texts = [item.text for item in here.told if isinstance(item, Event) and item.kind == "undecided"]
+    texts = [item.text for item in here.reported if isinstance(item, Event) and item.kind == "undecided"]
     assert texts[0] == "the process that fits the drift model has ended; the fixed plan goes on"
     assert texts[1] == "too few frames; the fixed plan goes on"
 

@@ -81,7 +81,7 @@ def test_both_forms_in_one_file_are_refused(added: str, sentence: str):
         parse_document(OLDER + added, StandConfig, "older.yaml")
 
 
-def test_a_fault_in_a_file_of_before_is_told_at_todays_place():
+def test_a_fault_in_a_file_of_before_is_reported_at_todays_place():
     with pytest.raises(ConfigError, match=r"^older.yaml: cameras.camera.exposure_s: must be greater than 0"):
         parse_document(OLDER.replace("exposure_s: 0.2", "exposure_s: 0"), StandConfig, "older.yaml")
 
@@ -126,7 +126,7 @@ def test_a_plan_says_which_device_it_lacks(sections: list[str], recipe: str, sen
         ),
     ],
 )
-def test_names_that_do_not_fit_are_told_in_one_sentence(change: Callable[[dict[str, Any]], object], sentence: str):
+def test_names_that_do_not_fit_are_reported_in_one_sentence(change: Callable[[dict[str, Any]], object], sentence: str):
     with pytest.raises(ConfigError, match=f"^stand.yaml: {sentence}") as caught:
         changed(change)
     assert "\n" not in str(caught.value)

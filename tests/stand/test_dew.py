@@ -139,11 +139,11 @@ def test_what_a_hygrometer_measures_counts_and_what_is_given_while_it_tells_noth
         dew={"humidity_percent": 50, "margin_K": 1, "flap_s": 10, "hygrometer": "room"},
         probes={"room": {"protocol": "vaisala", "address": "tcp:127.0.0.1:1"}},
     )
-    told = (
+    reported = (
         bad_reading("room.humidity", "%", 0, "no answer")
         if humidity_percent is None
         else Reading("room.humidity", humidity_percent, "%", 0)
     )
-    night.hub.publish(Batch("room", 0, (told, Reading("room.temperature", 24.0, "degC", 0))))
+    night.hub.publish(Batch("room", 0, (reported, Reading("room.temperature", 24.0, "degC", 0))))
     night.look(0, 1.0, target_degC)
     assert [fault.rule for fault in night.look(11, 1.0, target_degC)] == rules

@@ -1,4 +1,4 @@
-"""What a user is told of a file that cannot be used: the file, the line, the key, the value, and what to type."""
+"""What a user reads about a file that cannot be used: the file, the line, the key, the value, and what to type."""
 
 from pathlib import Path
 from time import process_time
@@ -39,9 +39,9 @@ EXPOSURE = next(line for line in STAND.splitlines() if line.strip().startswith("
         ("-1", "must be greater than 0 (got -1, line {})"),
     ],
 )
-def test_a_wrong_number_is_told_with_its_line_and_what_to_type(value: str, sentence: str):
-    told = refusal(EXPOSURE, f"{EXPOSURE.partition(':')[0]}: {value}")
-    assert told == f"mine.yaml: cameras.camera.exposure_s: {sentence.format(line_of(EXPOSURE))}"
+def test_a_wrong_number_is_reported_with_its_line_and_what_to_type(value: str, sentence: str):
+    reported = refusal(EXPOSURE, f"{EXPOSURE.partition(':')[0]}: {value}")
+    assert reported == f"mine.yaml: cameras.camera.exposure_s: {sentence.format(line_of(EXPOSURE))}"
 
 
 @pytest.mark.parametrize(
@@ -51,11 +51,11 @@ def test_a_wrong_number_is_told_with_its_line_and_what_to_type(value: str, sente
         ("colour", "colour: unknown key; correct its name, or take it out; known here: address,"),
     ],
 )
-def test_an_unknown_key_is_told_with_the_one_that_may_be_meant_or_those_there_are(key: str, sentence: str):
+def test_an_unknown_key_is_reported_with_the_one_that_may_be_meant_or_those_there_are(key: str, sentence: str):
     indent = EXPOSURE[: len(EXPOSURE) - len(EXPOSURE.lstrip())]
-    told = refusal(EXPOSURE, f"{EXPOSURE}\n{indent}{key}: 1")
-    assert told.startswith(f"mine.yaml: cameras.camera.{sentence}")
-    assert told.endswith(f"(line {line_of(EXPOSURE) + 1})")
+    reported = refusal(EXPOSURE, f"{EXPOSURE}\n{indent}{key}: 1")
+    assert reported.startswith(f"mine.yaml: cameras.camera.{sentence}")
+    assert reported.endswith(f"(line {line_of(EXPOSURE) + 1})")
 
 
 def test_keys_of_a_list_s_entries_are_known_too():
@@ -88,7 +88,7 @@ def test_keys_of_a_list_s_entries_are_known_too():
         ("name: a\x07", "the character number 8 must not be in a text"),
     ],
 )
-def test_what_yaml_reads_otherwise_than_it_was_meant_is_told(text: str, sentence: str):
+def test_what_yaml_reads_otherwise_than_it_was_meant_is_reported(text: str, sentence: str):
     with pytest.raises(ConfigError) as refused:
         parse_document(text, Recipe, "r.yaml")
     assert str(refused.value).startswith("r.yaml: ")
@@ -129,7 +129,7 @@ def parse_any(text: str) -> None:
         ),
     ],
 )
-def test_a_file_that_is_named_wrongly_is_told_with_the_file_and_key_that_name_it(
+def test_a_file_that_is_named_wrongly_is_reported_with_the_file_and_key_that_name_it(
     tmp_path: Path, key: str, old: str, sentence: str
 ):
     """When a night is planned, not when it is run."""

@@ -14,7 +14,7 @@ STEP_S = 30.0
 HOUR_S = 3600.0
 
 
-def told(
+def reported(
     hours: float,
     air_K: Callable[[float], float],
     sp_degC: Callable[[float], float] = lambda hour: 40.0,
@@ -43,22 +43,22 @@ def told(
 
 
 def test_ten_millikelvin_an_hour_are_found_and_reported_as_such():
-    found = told(12.0, lambda hour: 0.2 + 0.010 * hour)
+    found = reported(12.0, lambda hour: 0.2 + 0.010 * hour)
     assert 8 < found["sensor_drifts"] < 10.5
     assert found["text"] == 1
 
 
 def test_it_is_found_over_visits_of_the_same_set_point():
     visits = {0: 40.0, 1: 10.0, 2: 40.0, 3: 10.0, 4: 40.0}
-    found = told(15.0, lambda hour: 0.010 * hour, lambda hour: visits[int(hour // 3)])
+    found = reported(15.0, lambda hour: 0.010 * hour, lambda hour: visits[int(hour // 3)])
     assert 12 < found["sensor_drifts"] < 15
 
 
-def test_what_does_not_drift_is_not_told():
-    assert told(12.0, lambda hour: 0.3) == {}
+def test_what_does_not_drift_is_not_reported():
+    assert reported(12.0, lambda hour: 0.3) == {}
 
 
 def test_another_set_point_an_open_flap_and_a_thermometer_that_is_away_are_no_drift():
-    assert told(12.0, lambda hour: 0.004 * (40 if hour < 6 else 10), lambda hour: 40.0 if hour < 6 else 10.0) == {}
-    assert told(12.0, lambda hour: 0.0, flap=lambda hour: float(4 < hour < 8)) == {}
-    assert told(8.0, lambda hour: 5.0 if 3 < hour < 4 else 0.0, is_bad=lambda hour: 3 <= hour <= 4) == {}
+    assert reported(12.0, lambda hour: 0.004 * (40 if hour < 6 else 10), lambda hour: 40.0 if hour < 6 else 10.0) == {}
+    assert reported(12.0, lambda hour: 0.0, flap=lambda hour: float(4 < hour < 8)) == {}
+    assert reported(8.0, lambda hour: 5.0 if 3 < hour < 4 else 0.0, is_bad=lambda hour: 3 <= hour <= 4) == {}

@@ -73,7 +73,7 @@ async def test_a_camera_that_tells_no_temperature_is_soaked_for_five_time_consta
     assert reached.data == {"soaked_s": 3000.0, "rate_K_per_min": None}
 
 
-async def test_a_camera_that_goes_on_moving_is_told_and_waited_for():
+async def test_a_camera_that_goes_on_moving_is_reported_and_waited_for():
     events = await soaked(lambda time_s: 24.0 + time_s / 120.0, EquilibriumSettings(time_constant_s=600.0), 7000.0)
     assert [event.kind for event in events] == ["camera_equilibrium_lost"] + 2 * ["camera_equilibrium_late"]
 

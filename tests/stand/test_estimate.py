@@ -240,7 +240,7 @@ def test_the_time_left_is_corrected_by_what_steps_have_taken(config: StandConfig
     assert errors[20:] == pytest.approx([0.0] * 20, abs=1e-6)
 
 
-def test_a_single_delay_that_nobody_told_of_changes_nothing(config: StandConfig):
+def test_a_single_delay_that_nobody_announced_changes_nothing(config: StandConfig):
     plan = planned(*[Soak(600.0)] * 4)
     assert eta_errors(price(plan, config), plan, [5000.0, 600.0, 600.0, 600.0])[1:] == pytest.approx([0.0] * 7)
 

@@ -1,4 +1,4 @@
-"""The end of a run that moves is told, each time by another tenth of the whole."""
+"""The end of a run that moves is reported, each time by another tenth of the whole."""
 
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
@@ -10,8 +10,8 @@ class Night:
     """A run of ten hours whose end is set by the test."""
 
     def __init__(self):
-        self.now_s, self.end_s, self.hub, self.told = 0, 36_000, Hub(), []
-        self.hub.subscribe(lambda item: self.told.append(item) if item.kind == ETA_SLIPPED else None)
+        self.now_s, self.end_s, self.hub, self.reported = 0, 36_000, Hub(), []
+        self.hub.subscribe(lambda item: self.reported.append(item) if item.kind == ETA_SLIPPED else None)
         self.hub.subscribe(EtaSlip(self.hub, self, lambda _: self.end_s - self.now_s, lambda: 0))
 
     def now_ns(self):
@@ -21,22 +21,22 @@ class Night:
         self.hub.publish(StepMark(self.now_ns(), "a", 0, "Soak", StepState.DONE))
 
 
-def test_each_tenth_is_told_once():
+def test_each_tenth_is_reported_once():
     night = Night()
     for end_s in (36_000, 38_000, 39_600, 39_700, 43_100, 43_200, 40_000):
         night.now_s += 60
         night.end_s = end_s
         night.mark()
         night.mark()
-    assert [item.data["later_s"] for item in night.told] == [3600.0, 3600.0]
-    assert night.told[0].text.startswith("the run ends 60 min later than expected, at 1970-01-01 11:00:00 ")
-    assert night.told[0].level == "info"
+    assert [item.data["later_s"] for item in night.reported] == [3600.0, 3600.0]
+    assert night.reported[0].text.startswith("the run ends 60 min later than expected, at 1970-01-01 11:00:00 ")
+    assert night.reported[0].level == "info"
 
 
 def test_a_hold_that_ends_and_a_changed_plan_are_looked_at_and_nothing_else():
     night = Night()
     night.end_s = 45_000
     night.hub.publish(Event(0, "info", "note", "windy"))
-    assert night.told == []
+    assert night.reported == []
     night.hub.publish(Event(0, "info", "released", "disk_low", {"reason": "disk_low"}))
-    assert len(night.told) == 1
+    assert len(night.reported) == 1

@@ -14,8 +14,8 @@ REASONS = st.sampled_from(["operator", "interlock", "camera_lost", "disk_low"])
 
 @given(st.lists(st.tuples(REASONS, st.booleans()), max_size=20))
 def test_the_gate_is_open_exactly_when_no_reason_is_left_and_no_reason_clears_another(changes):
-    gate, standing, told = Gate(), set(), []
-    gate.subscribe(lambda reason, held: told.append((reason, held)))
+    gate, standing, reported = Gate(), set(), []
+    gate.subscribe(lambda reason, held: reported.append((reason, held)))
     expected = []
     for reason, held in changes:
         if held != (reason in standing):
@@ -23,20 +23,20 @@ def test_the_gate_is_open_exactly_when_no_reason_is_left_and_no_reason_clears_an
         (standing.add if held else standing.discard)(reason)
         (gate.hold if held else gate.clear)(reason)
         assert gate.reasons == standing
-        assert told == expected
+        assert reported == expected
 
 
 def test_the_last_listener_hears_of_a_change_after_all_others_and_stays_when_a_run_has_gone():
-    gate, told = Gate(), []
-    gate.subscribe_last(lambda reason, held: told.append("last"))
-    gate.subscribe(lambda reason, held: told.append("run"))
+    gate, reported = Gate(), []
+    gate.subscribe_last(lambda reason, held: reported.append("last"))
+    gate.subscribe(lambda reason, held: reported.append("run"))
     gate.hold("interlock")
     gate.let_go()
     gate.clear("interlock")
-    assert told == ["run", "last", "last"]
+    assert reported == ["run", "last", "last"]
 
 
-async def test_whoever_waits_passes_when_the_last_reason_goes():
+async def test_a_waiting_step_passes_when_the_last_reason_goes():
     gate = Gate()
     await gate.passed()
     gate.hold("operator")

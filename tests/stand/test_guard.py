@@ -159,8 +159,8 @@ async def test_a_hold_that_is_not_confirmed_safe_is_made_safe_again_every_minute
 
 
 async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, script: Callable[[str], str]):
-    told = tmp_path / "told"
-    bench = Bench("hold", command=(script(f'printf "%s" "$1" > {told}'),))
+    reported = tmp_path / "reported"
+    bench = Bench("hold", command=(script(f'printf "%s" "$1" > {reported}'),))
     bench.broken = KeyError("channel")
     time = asyncio.create_task(bench.clock.run())
     with pytest.raises(KeyError):
@@ -170,7 +170,7 @@ async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, sc
     assert bench.log == ["stop guard_failed", "revoke", "safe"]
     text = "the guard failed (KeyError: 'channel')"
     assert [(event.level, event.kind, event.text) for event in bench.events] == [("error", "guard.guard_failed", text)]
-    assert told.read_text() == text
+    assert reported.read_text() == text
 
 
 async def test_a_run_that_cannot_be_ended_does_not_keep_the_stand_from_being_made_safe():
@@ -303,7 +303,7 @@ async def test_a_hold_that_ends_by_itself_ends_when_the_stand_is_safe_and_nothin
     assert bench.guard.held is None
 
 
-async def test_a_hold_for_the_disk_ends_with_the_recording_and_is_not_told_to_be_over():
+async def test_a_hold_for_the_disk_ends_with_the_recording_and_is_not_reported_as_over():
     bench = Bench("hold")
     bench.guard.recording_ended()  # nothing is held
     bench.guard.held = Fault("not_recorded", "3 s are not on the disk", "hold")
@@ -349,7 +349,7 @@ async def test_only_an_operator_clears_a_hold_and_what_is_still_wrong_trips_agai
     assert [event.kind for event in bench.events] == ["guard.rule0"] * 3
 
 
-async def test_clearing_gives_every_rule_its_grace_time_anew():
+async def test_clearing_restarts_the_grace_time_of_every_rule():
     bench = Bench("hold")
     watch = bench.guard.watches[0]
     watch.grace_s = 10.0
@@ -397,7 +397,7 @@ async def test_without_a_way_to_hold_every_trip_aborts():
     assert bench.log == ["stop rule0", "revoke", "safe"]
 
 
-async def test_a_warning_is_told_when_it_begins_and_changes_nothing():
+async def test_a_warning_is_reported_when_it_begins_and_changes_nothing():
     bench = Bench("warn")
     for objecting in ({0}, {0}, set[int](), {0}):
         bench.objecting = objecting
@@ -408,7 +408,7 @@ async def test_a_warning_is_told_when_it_begins_and_changes_nothing():
 
 @pytest.fixture
 def script(tmp_path: Path) -> Callable[[str], str]:
-    """An executable shell script; what it is told is "$@"."""
+    """An executable shell script; what it is given is "$@"."""
 
     def make(body: str) -> str:
         path = tmp_path / "notify"
@@ -419,39 +419,39 @@ def script(tmp_path: Path) -> Callable[[str], str]:
     return make
 
 
-async def test_a_trip_is_told_to_a_command_as_one_argument(tmp_path: Path, script: Callable[[str], str]):
-    told = tmp_path / "told"
-    bench = Bench("hold", command=(script(f'printf "%s|" "$@" > {told}'), "--to", "a b"))
+async def test_a_command_gets_a_trip_as_one_argument(tmp_path: Path, script: Callable[[str], str]):
+    reported = tmp_path / "reported"
+    bench = Bench("hold", command=(script(f'printf "%s|" "$@" > {reported}'), "--to", "a b"))
     bench.objecting = {0}
     await bench.run_for(2)
-    assert told.read_text() == "--to|a b|it is so|"
+    assert reported.read_text() == "--to|a b|it is so|"
     assert [event.kind for event in bench.events] == ["guard.rule0"]
 
 
-async def test_a_run_that_is_taken_down_waits_until_somebody_was_told(tmp_path: Path, script: Callable[[str], str]):
+async def test_a_run_that_is_taken_down_waits_until_somebody_was_notified(tmp_path: Path, script: Callable[[str], str]):
     """The guard ends at once, while the command still runs: it only can in real time."""
-    told = tmp_path / "told"
-    bench = Bench("abort", command=(script(f"sleep 0.3; touch {told}; exit 3"),), clock=WallClock())
+    reported = tmp_path / "reported"
+    bench = Bench("abort", command=(script(f"sleep 0.3; touch {reported}; exit 3"),), clock=WallClock())
     bench.objecting = {0}
     watching = asyncio.create_task(bench.guard.run())
     while bench.log[-1:] != ["safe"]:
         await asyncio.sleep(0)
     await asyncio.wait([watching])
-    assert not told.exists()
+    assert not reported.exists()
     await bench.guard.notified()
-    assert told.exists()
+    assert reported.exists()
     assert [event.kind for event in bench.events] == ["guard.rule0", "notify_failed"]
 
 
-async def test_what_is_not_safe_is_told_with_the_trip(tmp_path: Path, script: Callable[[str], str]):
-    told = tmp_path / "told"
-    bench = Bench("abort", command=(script(f'printf "%s" "$1" > {told}'),))
+async def test_what_is_not_safe_is_reported_with_the_trip(tmp_path: Path, script: Callable[[str], str]):
+    reported = tmp_path / "reported"
+    bench = Bench("abort", command=(script(f'printf "%s" "$1" > {reported}'),))
     bench.actuator.failure = "no answer"
     bench.objecting = {0}
     assert not bench.guard.look()
     await bench.guard.notified()
     unsafe = "relays did not confirm its safe state: relays: no answer"
-    assert told.read_text() == f"it is so; NOT SAFE: {unsafe}"
+    assert reported.read_text() == f"it is so; NOT SAFE: {unsafe}"
     await bench.safety.close()
 
 
@@ -465,7 +465,7 @@ async def test_a_command_that_hangs_is_killed_and_an_event_while_the_hold_stands
 
 
 @pytest.mark.parametrize("command", ["/nowhere/tell", "no-such-program-here", "/dev/null"])
-async def test_a_command_that_cannot_be_run_is_told_when_the_watch_begins(command: str):
+async def test_a_command_that_cannot_be_run_is_reported_when_the_watch_begins(command: str):
     bench = Bench("hold", command=(command,))
     assert await bench.run_for(20)
     assert [(event.level, event.kind) for event in bench.events] == [("warning", "notify_failed")]

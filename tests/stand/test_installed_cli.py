@@ -18,7 +18,7 @@ def ask(app, *words: str) -> str:
 
 
 @pytest.mark.parametrize("app", [stand, compensate])
-def test_the_version_is_told(app):
+def test_the_version_is_shown(app):
     assert ask(app, "--version") == f"thermostand {importlib.metadata.version('thermostand')}\n"
 
 

@@ -1,4 +1,4 @@
-"""A daemon's Unix socket: a real one, and whoever may connect to it."""
+"""A daemon's Unix socket: a real one, and those who may connect to it."""
 
 import asyncio
 import contextlib
@@ -205,7 +205,7 @@ async def test_paths_longer_than_the_kernel_takes_are_served(tmp_path: Path, mon
     assert list((runtime / "thermostand").iterdir()) == []
 
 
-async def told_its_folder(session: Path) -> None:
+async def folder_stated(session: Path) -> None:
     """Return when the daemon has said which folder it is, whatever its name."""
     while not any(entry.identity for entry in entries_of(session)):
         await asyncio.sleep(0.01)
@@ -217,7 +217,7 @@ async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tm
     new.parent.mkdir()
     (tmp_path / "link").symlink_to(old.parent)
     async with served(ADesk(), old):
-        await told_its_folder(old)
+        await folder_stated(old)
 
         async def reached() -> list[object]:
             """By which of the names it is reached, and what it is called in each folder."""
@@ -243,12 +243,12 @@ def _answers(session: Path) -> bool:
         return False
 
 
-async def test_two_daemons_with_one_name_are_told_apart_by_the_folder(tmp_path: Path):
+async def test_two_daemons_with_one_name_are_distinguished_by_the_folder(tmp_path: Path):
     """The first one's session was renamed, and the next run took its name."""
     session, away = tmp_path / "night", tmp_path / "renamed"
     session.mkdir()
     async with served(ADesk("first"), session):
-        await told_its_folder(session)
+        await folder_stated(session)
         session.rename(away)
         session.mkdir()
         async with served(ADesk("second"), session):
@@ -324,7 +324,7 @@ async def test_what_a_killed_daemon_left_is_nobodys_and_is_removed(
         assert await asyncio.to_thread(_answers, tmp_path)
 
 
-def test_a_daemon_that_hangs_is_told_from_one_that_is_not_there(
+def test_a_daemon_that_hangs_is_distinguished_from_a_missing_one(
     tmp_path: Path, daemon: Callable[[Path], "subprocess.Popen[str]"]
 ):
     daemon(tmp_path).send_signal(signal.SIGSTOP)

@@ -111,7 +111,7 @@ async def test_no_request_by_the_document_or_against_it_makes_a_500(tmp_path: Pa
     assert min(seen[200], seen[404], seen[422]) > 10, seen
 
 
-async def test_what_fails_is_answered_with_a_sentence_told_as_an_event_and_hurts_nobody(tmp_path: Path):
+async def test_what_fails_is_answered_with_a_sentence_published_as_an_event_and_hurts_nobody(tmp_path: Path):
     port, desk = free_port(), Broken()
     events: list[str] = []
     desk.hub.subscribe(lambda item: events.append(getattr(item, "text", "")))

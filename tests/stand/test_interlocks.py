@@ -140,7 +140,7 @@ def test_bad_by_the_device_counts_at_the_second_poll_and_bad_by_the_wire_when_it
     assert (trips[0] if trips else None) == trips_at
 
 
-def test_a_device_that_was_good_between_two_looks_begins_anew():
+def test_a_device_that_was_good_between_two_looks_begins_again():
     hub, rule = hub_of(reading(24.0, 99.0)), trustworthy(AIR, 15.0)
     for time_s in (100, 101, 102, 103):
         bad = bad_reading(AIR, "degC", seconds_ns(time_s), "open wire")
@@ -151,7 +151,7 @@ def test_a_device_that_was_good_between_two_looks_begins_anew():
 
 
 def test_rules_know_the_last_value_over_a_poll_that_was_lost_on_the_wire():
-    """Else a line that loses a reply now and then would let each rule that needs time begin anew."""
+    """Else a line that loses a reply now and then would let each rule that needs time begin again."""
     hub = hub_of(reading(70.0, 99.0), bad_reading(AIR, "degC", seconds_ns(100), "late", "wire"))
     assert rule_of(over_temperature(AIR, 65.0)(hub, seconds_ns(100))) == "over_temperature"
     reported = Reading("regulator.fault", 1.0, "1", 0, reason="manual")
@@ -228,7 +228,7 @@ def test_an_open_flap_may_be_excused():
     assert rule(hub_with(flap_position=1.0), 0) is None
 
 
-def test_a_recorder_that_takes_no_frames_is_told_with_its_reason():
+def test_a_recorder_that_takes_no_frames_is_reported_with_its_reason():
     reason = [""]
     rule = frames_stopped(lambda: reason[0])
     assert rule(Hub(), 0) is None
@@ -243,9 +243,9 @@ def objecting(instants: set[int]) -> Rule:
 def test_a_watch_waits_until_its_rule_has_objected_without_a_break_for_its_grace_time():
     watch = Watch(objecting({1, 2, 4, 5, 6, 7, 8}), grace_s=3.0, action="hold")
     seen = {second: watch.check(Hub(), seconds_ns(second)) for second in range(10)}
-    told = Fault("rule", "it is so, for 3 s", "hold")
+    expected = Fault("rule", "it is so, for 3 s", "hold")
     assert {second for second, fault in seen.items() if fault is not None} == {7, 8}
-    assert seen[7] == told
+    assert seen[7] == expected
 
 
 def test_a_watch_without_grace_objects_at_once():

@@ -100,7 +100,7 @@ def flipped(path: Path, number: int) -> bytes:
     return path.read_bytes()
 
 
-def test_a_damaged_line_is_told_and_kept_aside_and_the_lines_after_it_count(tmp_path):
+def test_a_damaged_line_is_reported_and_kept_aside_and_the_lines_after_it_count(tmp_path):
     path = new_journal(tmp_path, *ENTRIES)
     damaged = flipped(path, 3)
     path.write_bytes(damaged + encode_line(ENTRIES[3])[:-4])  # and a torn tail
@@ -182,9 +182,9 @@ def test_a_whole_line_of_another_version_is_refused_with_a_sentence(tmp_path, li
 
 async def test_entries_that_the_disk_refuses_are_written_with_the_next(tmp_path):
     """The kernel refuses a file beyond a size, in the middle of a line, as a full disk would."""
-    told = []
+    reported = []
     journal = Journal.create(tmp_path)
-    journal.start(WallClock(), told.append)
+    journal.start(WallClock(), reported.append)
     await journal.write(ENTRIES[0])
     size_bytes = (tmp_path / JOURNAL_NAME).stat().st_size
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -194,7 +194,7 @@ async def test_entries_that_the_disk_refuses_are_written_with_the_next(tmp_path)
         await journal.write(ENTRIES[2])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert told == ["journal.jsonl cannot be written (No space left on device); its entries wait in memory"]
+    assert reported == ["journal.jsonl cannot be written (No space left on device); its entries wait in memory"]
     assert (tmp_path / JOURNAL_NAME).stat().st_size == size_bytes
     await journal.write(ENTRIES[3])
     await journal.close()

@@ -11,7 +11,7 @@ GRANITE = "thermometers.granite_outside"
 
 def texts(values: list[tuple[float, float | None]]) -> list[str]:
     """What the rule says after each (instant s, degC; None: BAD), at looks of 1 s; the same twice in a row once."""
-    hub, rule, told = Hub(), jumped(GRANITE, 2.0, 15.0), list[str]()
+    hub, rule, reported = Hub(), jumped(GRANITE, 2.0, 15.0), list[str]()
     due = dict(values)
     for second in range(int(values[-1][0]) + 10):
         if second in due:
@@ -24,12 +24,12 @@ def texts(values: list[tuple[float, float | None]]) -> list[str]:
             hub.publish(Batch("thermometers", now_ns, (reading,)))
         fault = rule(hub, seconds_ns(second))
         said = "" if fault is None else fault.text
-        if said and (not told or told[-1] != said):
-            told.append(said)
-    return told
+        if said and (not reported or reported[-1] != said):
+            reported.append(said)
+    return reported
 
 
-def test_a_jump_is_told_with_both_values_and_once():
+def test_a_jump_is_reported_with_both_values_and_once():
     (text,) = texts([(0, 24.0), (5, 24.1), (10, 27.0), (15, 27.1), (20, 27.0)])
     assert text == "thermometers.granite_outside went by +2.90 K within 5 s, to 27.00 degC: look at its cable"
 

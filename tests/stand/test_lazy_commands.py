@@ -49,23 +49,23 @@ def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):
         assert process.stderr.read() == "interrupted; nothing was started\n"
 
 
-def test_an_unknown_command_is_told_with_the_nearest_one():
+def test_an_unknown_command_is_reported_with_the_nearest_one():
     app = lazy_app("x", {"go": Lazy("nowhere", "go")})
     result = CliRunner().invoke(app, ["goo"])
     assert (result.exit_code, "Did you mean 'go'?" in result.stderr) == (2, True)
 
 
-@pytest.mark.parametrize(("told", "used"), [(None, "1"), ("3", "3")])
-def test_a_command_computes_with_one_thread_unless_told_otherwise(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, used: str
+@pytest.mark.parametrize(("reported", "used"), [(None, "1"), ("3", "3")])
+def test_a_command_computes_with_one_thread_unless_the_environment_says_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reported: str | None, used: str
 ):
     (tmp_path / f"shows_{used}.py").write_text(
         "import os, typer\napp = typer.Typer()\nthreads = os.environ['OPENBLAS_NUM_THREADS']\n"
         "@app.command()\ndef go() -> None:\n    print('threads:', threads)\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", told or "")  # pytest puts back what was there
-    if told is None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", reported or "")  # pytest puts back what was there
+    if reported is None:
         monkeypatch.delenv("OPENBLAS_NUM_THREADS")
     result = CliRunner().invoke(lazy_app("x", {"go": Lazy(f"shows_{used}", "go")}), ["go"])
     assert result.output == f"threads: {used}\n"

@@ -115,7 +115,7 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
         recording = asyncio.create_task(recorder.run())
         log, journal = Logbook(hub, clock, RunState(())), Journal.create(recorder.directory)
         await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
-        queue, told = DiskCalls(own, QUEUE_LINE, clock), []
+        queue, reported = DiskCalls(own, QUEUE_LINE, clock), []
         entry = Entry(id=1, recipe="r", config="c", config_text="", recipe_text="", target_text="", added_ns=1)
         await queue.call(append, tmp_path, entry)
         kept = KeptFile(tmp_path, own.line(FILES_LINE).run, hub, clock)
@@ -140,7 +140,7 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
 
         try:
             with pytest.raises(Interrupted):
-                await drain(tmp_path, run_one, clock, told.append, queue, stop.patience)
+                await drain(tmp_path, run_one, clock, reported.append, queue, stop.patience)
             kept.note(Kept())
             await kept.close(stop.patience)
             await compressor.close(stop.patience)
@@ -148,6 +148,6 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
         finally:
             for each in (disk, own):
                 os.kill(each.pid, signal.SIGKILL)
-        assert told[-1].endswith("the queue does not know it yet")
+        assert reported[-1].endswith("the queue does not know it yet")
 
     assert BUDGET_S <= took_s(leave) < BUDGET_S + 6 * LEAST_S

@@ -189,7 +189,7 @@ async def test_a_recorded_session_gives_its_curves_and_marks_again(tmp_path):
     assert all(mark.end_ns is not None for mark in found.marks if mark.level == "step")
 
 
-async def test_after_a_restart_the_week_is_there_again_and_what_cannot_be_read_is_told(tmp_path):
+async def test_after_a_restart_the_week_is_there_again_and_what_cannot_be_read_is_reported(tmp_path):
     await record(tmp_path / "night", 12, half_second)
     (tmp_path / "broken" / "telemetry").mkdir(parents=True)
     (tmp_path / "broken" / "telemetry" / "0000.mcap").write_bytes(b"nothing")

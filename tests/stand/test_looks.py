@@ -113,7 +113,7 @@ def test_a_camera_that_warms_tells_when_its_own_excess_is_known():
     assert warmed_s <= 400
 
 
-def test_a_camera_that_was_off_is_learned_anew_and_one_that_does_not_move_is_not_believed():
+def test_a_camera_that_was_off_is_learned_again_and_one_that_does_not_move_is_not_believed():
     feed = Feed(camera_feels(CAMERA_LIMITS, CAMERA_LAG_S, CAMERA, AIR))
     assert feed.run(2500) is None
     assert feed.run(120, camera_temperature=constant(math.nan)) is None

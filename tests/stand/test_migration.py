@@ -107,7 +107,7 @@ def test_entries_that_do_not_stand_on_their_lines_lose_their_comments_which_is_s
     assert "  camera: {address: 127.0.0.20}   # left" in found.text
 
 
-def test_a_file_that_is_one_flow_mapping_is_written_anew():
+def test_a_file_that_is_one_flow_mapping_is_written_again():
     found = migrated(yaml.safe_dump(yaml.safe_load(FLOW), default_flow_style=True, width=10**6), "stand.yaml")
     assert found is not None
     assert found.without_comments_of == ("the whole file",)

@@ -39,9 +39,9 @@ def said(call: Callable[[], object], error: type[StandError] = ConfigError) -> s
 )  # fmt: skip
 def test_a_value_of_another_kind(old: str, new: str, sentence: str):
     assert STAND.count(old) == 1, old
-    told = said(lambda: parse_document(STAND.replace(old, new), StandConfig, "mine.yaml"))
-    assert told.startswith(f"mine.yaml: {sentence}")
-    assert told.count("mine.yaml") == 1  # one mistake, one sentence
+    said_so = said(lambda: parse_document(STAND.replace(old, new), StandConfig, "mine.yaml"))
+    assert said_so.startswith(f"mine.yaml: {sentence}")
+    assert said_so.count("mine.yaml") == 1  # one mistake, one sentence
 
 
 def test_files_that_were_exchanged(tmp_path: Path):
@@ -53,24 +53,24 @@ def test_files_that_were_exchanged(tmp_path: Path):
         "mine.yaml: is a stand's file, and a recipe is wanted here (one with `experiments:` or `steps:`); give a "
         "stand's file behind --config"
     )
-    told = said(lambda: packaged("", str(tmp_path)))
-    assert told.startswith(f"{tmp_path}: is a folder; give a file in it, or one of those installed: laboratory")
+    said_so = said(lambda: packaged("", str(tmp_path)))
+    assert said_so.startswith(f"{tmp_path}: is a folder; give a file in it, or one of those installed: laboratory")
 
 
 def test_a_text_that_is_not_in_utf8(tmp_path: Path):
     file = tmp_path / "mine.yaml"
     file.write_bytes(STAND.replace('operator: ""', 'operator: "Müller"').encode("latin-1"))
-    told = said(lambda: load_document(file, StandConfig))
-    assert told == f"{file}: cannot be read (line 5 is not UTF-8; save the file as UTF-8)"
+    said_so = said(lambda: load_document(file, StandConfig))
+    assert said_so == f"{file}: cannot be read (line 5 is not UTF-8; save the file as UTF-8)"
 
 
 @pytest.mark.parametrize("registers", ["waveshare-relay", "omron-e5cc"])
 def test_a_register_map_of_another_unit_for_thermometers(tmp_path: Path, registers: str):
     file = tmp_path / "mine.yaml"
     file.write_text(STAND.replace("registers: icpdas-m7015", f"registers: {registers}"))
-    told = said(lambda: load_order("trial", str(file)))
-    assert told.startswith(f"{file}: thermometer_module: register map ")
-    assert told.endswith("lacks value_0; it is of no thermometer module")
+    said_so = said(lambda: load_order("trial", str(file)))
+    assert said_so.startswith(f"{file}: thermometer_module: register map ")
+    assert said_so.endswith("lacks value_0; it is of no thermometer module")
 
 
 def test_what_is_no_session_and_no_model(tmp_path: Path):

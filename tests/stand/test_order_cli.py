@@ -44,7 +44,7 @@ async def test_a_run_is_begun_at_an_address_and_what_is_of_this_machine_is_refus
     assert [run.recipe for run in desk.queue] == ["demo"]
 
 
-async def test_a_device_is_told_something_over_the_network(tmp_path: Path):
+async def test_a_device_is_commanded_over_the_network(tmp_path: Path):
     port, token = free_port(), tmp_path / "token"
     token.write_text(TOKEN)
     interface = Interface(tmp_path, port=port, tokens={"rose": TOKEN})

@@ -287,12 +287,12 @@ async def test_steps_and_parts_within_parts_have_fields_of_their_own(night):
         await page.get_by_label("soak", exact=True).last.fill("90")
         await page.get_by_role("button", name="Add to the queue").click()
         await page.get_by_text("is queued").wait_for()
-        told = json.loads(night.requests[night.queue[-1].key][0].recipe_text)
-        assert told["steps"][-1] == {"soak": 90}
-        repeat = next(step["repeat"] for step in told["steps"] if "repeat" in step)
+        reported = json.loads(night.requests[night.queue[-1].key][0].recipe_text)
+        assert reported["steps"][-1] == {"soak": 90}
+        repeat = next(step["repeat"] for step in reported["steps"] if "repeat" in step)
         assert repeat["steps"][0]["ramp"]["rate_K_per_min"] == 0.7
         before = len(list(parse_document(packaged("recipes", "ramps").read_text(), Recipe, "ramps").plan()))
-        assert len(list(parse_document(json.dumps(told), Recipe, "sent").plan())) == before + 1
+        assert len(list(parse_document(json.dumps(reported), Recipe, "sent").plan())) == before + 1
 
 
 async def test_runs_are_moved_by_buttons_and_by_dragging_and_removed_after_a_question(night):

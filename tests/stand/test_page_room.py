@@ -99,7 +99,7 @@ async def test_curves_of_the_night_are_given_decimated(night):
 @pytest.mark.parametrize(
     "query", ["from_ns=5&to_ns=5", "from_ns=9&to_ns=5", "from_ns=0&to_ns=5&points=0", "to_ns=5", "from_ns=a&to_ns=1"]
 )
-async def test_what_is_no_time_is_told_in_a_sentence(night, query):
+async def test_what_is_no_time_is_reported_in_a_sentence(night, query):
     status, _, data = await ask(night, f"/api/v1/history?{query}")
     assert status == 422
     assert json.loads(data)["error"]
@@ -174,9 +174,9 @@ async def test_a_process_that_ends_is_a_warning_and_the_curves_go_on(own_night):
     async with asyncio.timeout(30):
         while not [event for event in events if event.kind == "preview"]:
             await asyncio.sleep(0.05)
-    (told,) = [event for event in events if event.kind == "preview"]
-    assert told.level == "warning"
-    assert "killed by SIGKILL" in told.text or "has ended" in told.text
+    (reported,) = [event for event in events if event.kind == "preview"]
+    assert reported.level == "warning"
+    assert "killed by SIGKILL" in reported.text or "has ended" in reported.text
     curves = f"/api/v1/history?from_ns={own_night.began_ns}&to_ns={own_night.clock.now_ns()}"
     assert (await ask(own_night, curves))[0] == 200
     assert (await ask(own_night, "/api/v1/frame"))[0] == 200  # the last one stays

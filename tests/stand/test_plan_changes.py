@@ -67,8 +67,8 @@ def life(tmp_path: Path):
 
     def begin(start_ns: int = START_NS, plan=PLAN) -> Life:
         begun = Life(tmp_path, plan, start_ns, disk, 24.0)
-        begun.told = []
-        begun.hub.subscribe(begun.told.append)
+        begun.reported = []
+        begun.hub.subscribe(begun.reported.append)
         lives.append(begun)
         return begun
 
@@ -80,7 +80,7 @@ def life(tmp_path: Path):
 
 def passes_until(life: Life, kind: str, late_s: float = 0.0) -> None:
     """Until a step of that kind is under way, and so much longer."""
-    while not any(isinstance(item, StepMark) and item.kind == kind for item in life.told):
+    while not any(isinstance(item, StepMark) and item.kind == kind for item in life.reported):
         assert not life.run.done()
         life.passes(0.5)
     life.passes(late_s)
@@ -88,11 +88,13 @@ def passes_until(life: Life, kind: str, late_s: float = 0.0) -> None:
 
 def marks(life: Life) -> list[str]:
     """What became of the steps that have ended, in this life."""
-    return [f"{m.kind} {m.state}" for m in life.told if isinstance(m, StepMark) and m.state is not StepState.STARTED]
+    return [
+        f"{m.kind} {m.state}" for m in life.reported if isinstance(m, StepMark) and m.state is not StepState.STARTED
+    ]
 
 
 def soaked_s(life: Life) -> float:
-    begun, ended = (m.time_ns for m in life.told if isinstance(m, StepMark) and m.kind == "Soak")
+    begun, ended = (m.time_ns for m in life.reported if isinstance(m, StepMark) and m.kind == "Soak")
     return (ended - begun) / NS_PER_S
 
 
@@ -108,7 +110,7 @@ def test_a_soak_that_is_left_out_ends_at_once(life: Callable[..., Life]):
     here.passes(3.0)
     assert marks(here) == ["StartChamber done", "Soak skipped", "OpenFlap done"]
     assert soaked_s(here) == pytest.approx(10.0, abs=0.6)
-    (event,) = [item for item in here.told if isinstance(item, Event) and item.kind == "plan_changed"]
+    (event,) = [item for item in here.reported if isinstance(item, Event) and item.kind == "plan_changed"]
     assert event.data == {"change": "Skipped", "step_id": ID[1], "steps": 8, "frames": 4}
 
 
@@ -116,10 +118,10 @@ def test_a_capture_that_is_left_out_keeps_its_frames(life: Callable[..., Life]):
     here = life()
     passes_until(here, "Capture", 7.0)
     here.do(here.executor.skip(ID[3]))
-    frames = [item for item in here.told if isinstance(item, Frame)]
+    frames = [item for item in here.reported if isinstance(item, Frame)]
     here.passes(3.0)
     assert marks(here)[-2:] == ["Capture skipped", "CloseFlap done"]
-    assert [item for item in here.told if isinstance(item, Frame)] == frames
+    assert [item for item in here.reported if isinstance(item, Frame)] == frames
     assert here.log.state.size == {"steps": 8, "frames": len(frames)}
     assert 0 < len(frames) < CAPTURE.frames
 
@@ -155,7 +157,7 @@ def test_a_soak_under_way_that_is_extended_takes_longer_by_that(life: Callable[.
     here.do(here.executor.extend(ID[1], 45.0))
     here.passes(150.0)
     assert soaked_s(here) == pytest.approx(145.0)
-    done = next(m for m in here.told if isinstance(m, StepMark) and m.kind == "Soak" and m.state is StepState.DONE)
+    done = next(m for m in here.reported if isinstance(m, StepMark) and m.kind == "Soak" and m.state is StepState.DONE)
     assert done.parameters == {"duration_s": 145.0}
     assert done.step_id == ID[1]
 
@@ -168,7 +170,7 @@ def test_the_rest_of_a_plan_is_replaced(life: Callable[..., Life]):
     here.passes(200.0)
     assert here.run.done()
     assert marks(here) == [f"{kind_of(step)} done" for step in (StartChamber(0), Soak(0), *rest)]
-    (event,) = [item for item in here.told if isinstance(item, Event) and item.kind == "plan_changed"]
+    (event,) = [item for item in here.reported if isinstance(item, Event) and item.kind == "plan_changed"]
     assert (event.data["from_index"], event.data["steps"], event.data["frames"]) == (2, 5, 0)
     assert [step_of(each["kind"], each["parameters"]) for each in cast("Any", event.data["by"])] == rest
 
@@ -202,7 +204,7 @@ def test_a_capture_left_out_stays_so_after_a_kill_and_a_second_change_comes_on_t
     assert here.run.done()
     assert [each.step_id for each in here.log.state.plan[:6]] == ID[:6]
     assert marks(here)[-1] == "StopChamber done"
-    assert not [item for item in here.told if isinstance(item, Frame)]
+    assert not [item for item in here.reported if isinstance(item, Frame)]
 
 
 def test_a_change_whose_line_is_lost_is_known_by_the_recording(life: Callable[..., Life], tmp_path: Path):
@@ -230,7 +232,7 @@ def test_a_plan_that_this_stand_may_not_do_changes_nothing(life: Callable[..., L
     with pytest.raises(ConfigError, match="3 steps are too many"):
         here.do(here.executor.edit(2, [StopChamber()]))
     assert here.log.state is before
-    assert not [item for item in here.told if isinstance(item, Event) and item.kind == "plan_changed"]
+    assert not [item for item in here.reported if isinstance(item, Event) and item.kind == "plan_changed"]
 
 
 BEGUN = fold(PLAN, [Step(0, ID[0], "started"), Step(0, ID[0], "done"), Step(0, ID[1], "started")])

@@ -284,7 +284,7 @@ def test_only_a_heater_that_is_on_must_warm(mv_heat: float, permit: float, trips
     assert any(faults) is trips
 
 
-def test_a_heater_that_pauses_begins_anew():
+def test_a_heater_that_pauses_begins_again():
     hub, rule = Hub(), heater_not_warming(LIMITS, "regulator", PERMIT)
     publish_all(hub, {PERMIT: 1.0, "regulator.sp": 40.0, PV: 24.0})
     for second in range(0, 4000, 10):

@@ -31,7 +31,7 @@ def shot(scene, time_ns=1, **kwargs):
     return Shot("camera", time_ns, image_of(scene), **kwargs)
 
 
-def test_drift_is_told_against_the_reference_and_is_the_true_one():
+def test_drift_is_shown_against_the_reference_and_is_the_true_one():
     previewer = Previewer(PAPER)
     first = previewer.look(shot(SMALL, role="reference", as_reference=True))
     assert (first.mean_px, first.expected, len(first.markers)) == (0.0, 54, 54)
@@ -46,7 +46,7 @@ def test_drift_is_told_against_the_reference_and_is_the_true_one():
     assert (dx, dy) == pytest.approx(truth[number - 1], abs=0.06)
 
 
-def test_of_a_target_that_is_moved_on_purpose_no_drift_is_told():
+def test_of_a_target_that_is_moved_on_purpose_no_drift_is_shown():
     previewer = Previewer(PAPER)
     previewer.look(shot(SMALL, role="reference", as_reference=True))
     found = previewer.look(shot(MOVED, 2, role="calibration"))
@@ -79,7 +79,7 @@ def test_the_edges_are_as_wide_as_the_blur_makes_them():
         assert found.contrast_DN == pytest.approx(170, rel=0.03)
 
 
-def test_too_much_light_is_told():
+def test_too_much_light_is_reported():
     image = image_of(SMALL).copy()
     image[:128] = 255
     setup = setup_of(image, None, PAPER)
@@ -88,7 +88,7 @@ def test_too_much_light_is_told():
 
 
 @pytest.mark.parametrize(("x_deg", "y_deg"), [(20.0, 0.0), (0.0, 12.0), (-15.0, 8.0)])
-def test_the_tilt_of_the_target_is_told(x_deg, y_deg):
+def test_the_tilt_of_the_target_is_reported(x_deg, y_deg):
     scene = replace(SMALL, tilt_x_deg=x_deg, tilt_y_deg=y_deg)
     found = detect(image_of(scene), PAPER)
     normal = np.cos(np.radians(x_deg)) * np.cos(np.radians(y_deg))

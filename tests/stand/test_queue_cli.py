@@ -38,9 +38,9 @@ def test_runs_are_added_listed_moved_and_removed(tmp_path: Path):
         ["3", "1", "warm-up", "waiting"],
         ["2", "2", "demo", "waiting"],
     ]
-    told = json.loads(invoke(tmp_path, "list", "--json").stdout)
-    assert told["halted"] == ""
-    assert [(run["id"], run["recipe"], run["state"]) for run in told["runs"]] == [
+    reported = json.loads(invoke(tmp_path, "list", "--json").stdout)
+    assert reported["halted"] == ""
+    assert [(run["id"], run["recipe"], run["state"]) for run in reported["runs"]] == [
         (3, "warm-up", "waiting"),
         (2, "demo", "waiting"),
     ]
@@ -75,7 +75,7 @@ def test_what_has_ended_and_why_nothing_is_begun_are_listed(tmp_path: Path):
         (["remove", "9"], 1, "no run 9 in the queue"),
     ],
 )
-def test_a_mistake_is_told_in_one_sentence_and_changes_nothing(
+def test_a_mistake_is_reported_in_one_sentence_and_changes_nothing(
     tmp_path: Path, arguments: list[str], status: int, sentence: str
 ):
     invoke(tmp_path, "add", "demo")
@@ -96,7 +96,7 @@ def test_an_empty_queue_has_nothing_to_list_or_start(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_queue_is_told_not_shown(tmp_path: Path):
+def test_a_damaged_queue_is_reported_not_shown(tmp_path: Path):
     invoke(tmp_path, "add", "demo")
     (tmp_path / QUEUE_NAME).write_text("{")
     result = invoke(tmp_path, "list")

@@ -149,7 +149,7 @@ def test_what_is_queued_is_what_the_files_were_when_they_were_added(tmp_path: Pa
         ("name: bad\nexperiments: [{thermal_cycle: {set_points_degC: [65]}}]\n", r"outside limits\.chamber_degC"),
     ],
 )
-def test_a_typo_is_told_when_a_recipe_is_added_not_at_night(tmp_path: Path, text: str, sentence: str):
+def test_a_typo_is_reported_when_a_recipe_is_added_not_at_night(tmp_path: Path, text: str, sentence: str):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(text)
     with pytest.raises(ConfigError, match=sentence):

@@ -1,4 +1,4 @@
-"""The queue is worked with runs that do as they are told."""
+"""The queue is worked with runs that do as they are asked."""
 
 import asyncio
 import fcntl
@@ -191,7 +191,7 @@ def worker_killed(directory: Path, steps_done: int) -> None:
 async def test_a_run_whose_daemon_dies_three_times_before_another_step_is_set_aside(tmp_path: Path):
     runs = Runs(tmp_path, None)
     queue.add(tmp_path, ORDER, "simulated", 1)
-    for steps_done in (0, 0, 2, 0, 0, 0):  # what the third has done begins the count anew
+    for steps_done in (0, 0, 2, 0, 0, 0):  # what the third has done begins the count again
         worker_killed(tmp_path, steps_done)
         assert runs.entries()[0] == ("interrupted", "night", "its daemon was killed")
     await runs.work()

@@ -18,19 +18,19 @@ async def test_a_file_tells_which_features_would_be_used(tmp_path: Path):
     require_aravis()
     file = tmp_path / "abs.xml"
     file.write_bytes(DIALECTS["abs"].xml("abs"))
-    told = await rehearse(file)
-    assert (told.camera, told.refusal) == ("Dialects abs", "")
-    assert told.features["exposure"] == "ExposureTimeAbs"
-    assert told.features["temperature"].startswith("TemperatureAbs of TemperatureSelector 'Sensorboard'")
-    assert told.features["frame"].startswith("2448 x 2048 px, Mono8")
+    reported = await rehearse(file)
+    assert (reported.camera, reported.refusal) == ("Dialects abs", "")
+    assert reported.features["exposure"] == "ExposureTimeAbs"
+    assert reported.features["temperature"].startswith("TemperatureAbs of TemperatureSelector 'Sensorboard'")
+    assert reported.features["frame"].startswith("2448 x 2048 px, Mono8")
 
 
 async def test_a_file_that_lacks_something_says_what(tmp_path: Path):
     require_aravis()
     file = tmp_path / "none.xml"
     file.write_bytes(DIALECTS["no exposure"].xml("none"))
-    told = await rehearse(file)
-    assert "the camera has no ExposureTime" in told.refusal
+    reported = await rehearse(file)
+    assert "the camera has no ExposureTime" in reported.refusal
 
 
 async def test_what_is_no_genicam_file_is_refused(tmp_path: Path):
@@ -55,8 +55,8 @@ def test_the_command_says_it_and_its_status_whether_it_opened(tmp_path: Path, di
     assert result.exit_code == status
     assert shown in result.output
     if status:
-        told = json.loads(CliRunner().invoke(app, ["check", "--genicam", str(file), "--json"]).stdout)
-        assert "ExposureTime" in told["refusal"]
+        checked = json.loads(CliRunner().invoke(app, ["check", "--genicam", str(file), "--json"]).stdout)
+        assert "ExposureTime" in checked["refusal"]
 
 
 async def test_the_exposure_of_ones_own_stand_is_tried_and_without_one_such_as_each_camera_makes(tmp_path: Path):

@@ -95,10 +95,10 @@ def test_the_kinds_that_are_published_were_found():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_kind_has_a_line_of_its_own(kind: str):
-    told = next_command(kind, {"status": "stopped"}, "/data/a night")
-    assert told != GENERIC
-    assert "{" not in told
-    assert "DIR" not in told
+    reported = next_command(kind, {"status": "stopped"}, "/data/a night")
+    assert reported != GENERIC
+    assert "{" not in reported
+    assert "DIR" not in reported
 
 
 @pytest.mark.parametrize("rule", remedies._OF_RULE)

@@ -33,7 +33,7 @@ class Table:
         }
 
     def look(self, time_s: float, **changed: float) -> list[Fault]:
-        """All read anew, with a little noise, then every rule asked."""
+        """All read again, with a little noise, then every rule asked."""
         time_ns = seconds_ns(time_s)
         values = self.values | {name.replace("_", ".", 1): value for name, value in changed.items()}
         noise = {"thermometers.air", "thermometers.granite_inside"}

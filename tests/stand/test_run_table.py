@@ -243,7 +243,7 @@ def test_what_is_restored_is_what_the_steps_before_have_set_up():
     assert next_action(*met("camera off", "killed")).set_up.camera_on is False
 
 
-def test_a_warm_up_begins_anew_from_the_switch_that_made_it_cold_without_what_the_operator_did():
+def test_a_warm_up_begins_again_from_the_switch_that_made_it_cold_without_what_the_operator_did():
     again = next_action(*met("warming up", "killed")).again
     assert [planned.step_id for planned in again] == [OFF, COOL, ON, WARM]
     state = after(met("warming up", "killed")[0], Again(0, [OFF, COOL, ON, WARM]))

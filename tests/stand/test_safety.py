@@ -70,7 +70,7 @@ async def test_permissions_are_gone_when_the_demand_returns_and_every_actuator_i
         assert bench.kinds() == []
 
 
-async def test_a_link_that_is_gone_is_tried_until_it_is_back_and_each_minute_is_told():
+async def test_a_link_that_is_gone_is_tried_until_it_is_back_and_each_minute_is_reported():
     async with running() as bench:
         bench.relays.failure = Unreachable("relays", "no answer")
         bench.safety.demand()

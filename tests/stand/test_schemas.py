@@ -74,14 +74,14 @@ def test_a_recipe_that_waits_until_settled_fits():
         assert [fault.message for fault in validator("recipe").iter_errors(recipe)] == []
 
 
-def test_the_commands_write_them_where_they_are_told(tmp_path: Path):
+def test_the_commands_write_them_at_the_place_given(tmp_path: Path):
     for app, words in ((stand, ["config", "schema"]), (compensate, ["schema"])):
         result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "new" / "folder")])
         assert result.exit_code == 0, result.output
     assert {path.stem for path in (tmp_path / "new" / "folder").iterdir()} == set(ALL)
 
 
-def test_a_place_that_refuses_is_told(tmp_path: Path):
+def test_a_place_that_refuses_is_reported(tmp_path: Path):
     (tmp_path / "file").write_text("")
     result = CliRunner().invoke(stand, ["config", "schema", "--out", str(tmp_path / "file")])
     assert (result.exit_code, result.stderr.count("\n")) == (1, 1), result.output

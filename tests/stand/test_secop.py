@@ -140,7 +140,7 @@ async def test_what_is_read_has_its_time_and_what_is_no_measurement_is_an_error(
         assert (await talk.asked("read thermometers_granite:status"))[2][0] == [400, "wire is broken"]
 
 
-async def test_who_is_active_is_told_all_and_then_what_changes(tmp_path: Path):
+async def test_an_active_client_gets_everything_and_then_what_changes(tmp_path: Path):
     desk = SecopDesk()
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert await talk.ask("activate") == "active"
@@ -321,8 +321,8 @@ async def test_who_was_made_to_speak_here_orders_nothing(tmp_path: Path, head: s
     desk = SecopDesk()
     async with node(desk, tmp_path) as port, talking(port) as talk:
         talk.say(f"{head}\r\n*IDN?", "do run:stop", "change chamber:target 60", 'do run:_submit "overnight"')
-        told = await talk.end()
-        assert told.count(b"\n") <= 1
+        reported = await talk.end()
+        assert reported.count(b"\n") <= 1
         async with talking(port) as other:
             assert (await other.asked("read chamber"))[0] == "reply"
     assert desk.orders == []

@@ -17,25 +17,25 @@ LIMIT_S = 20.0
 
 
 class Follower:
-    """What the client was told, and a way to wait for it."""
+    """What the client has received, and a way to wait for it."""
 
     def __init__(self, port: int) -> None:
         self.peer = client.SecopClient(f"tcp://127.0.0.1:{port}", log=None)
-        self._told = threading.Condition()
+        self._changed = threading.Condition()
         self.peer.register_callback(None, updateItem=self._update)
 
     def _update(self, module: str, parameter: str, item: object) -> None:
-        with self._told:
-            self._told.notify_all()
+        with self._changed:
+            self._changed.notify_all()
 
     def item(self, module: str, parameter: str) -> Any:
         return self.peer.cache[module, parameter]
 
     def until(self, wanted: Callable[[], bool]) -> None:
         end_s = time.monotonic() + LIMIT_S
-        with self._told:
+        with self._changed:
             while not wanted():
-                assert self._told.wait(end_s - time.monotonic()), "not in time"
+                assert self._changed.wait(end_s - time.monotonic()), "not in time"
 
 
 def converse(port: int, desk: SecopDesk, on_loop: Callable[[Callable[[], object]], object]) -> None:

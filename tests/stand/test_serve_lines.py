@@ -20,7 +20,7 @@ def shown(wanted: Output) -> None:
         hub.publish(LOST)
 
 
-def test_people_are_told_what_to_type(capsys: pytest.CaptureFixture[str]):
+def test_people_read_what_to_type(capsys: pytest.CaptureFixture[str]):
     shown(Output())
     assert capsys.readouterr() == ("", "linear does not answer; `stand devices` shows what is connected\n")
 

@@ -1,4 +1,4 @@
-"""`stand service install` shows a unit and rules, and writes them when it is told to."""
+"""`stand service install` shows a unit and rules, and writes them when it is asked to."""
 
 import configparser
 import shlex

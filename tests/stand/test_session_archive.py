@@ -31,7 +31,7 @@ def ask(*arguments: object, status: int = 0):
     return result
 
 
-def test_finished_sessions_are_copied_and_the_others_are_told(sessions: Path, tmp_path: Path):
+def test_finished_sessions_are_copied_and_the_others_are_reported(sessions: Path, tmp_path: Path):
     nas = tmp_path / "nas"
     result = ask("archive", sessions, "--to", nas)
     assert result.stdout.startswith(f"a: copied to {nas}/a and read back (")
@@ -67,8 +67,8 @@ def test_copies_elsewhere_do_not_count_and_one_that_is_gone_is_said_to_be(sessio
     (name,) = found["copied"]
     assert (other / name).is_dir()
     shutil.rmtree(other / name)
-    told = ask("archive", sessions, "--to", other, status=1)
-    assert f"{(other / name).resolve()}: the copy is gone; is its disk connected?" in told.stderr
+    answer = ask("archive", sessions, "--to", other, status=1)
+    assert f"{(other / name).resolve()}: the copy is gone; is its disk connected?" in answer.stderr
     assert not (other / name).exists()  # the disk that its place is on is not filled
     ask("archive", sessions, "--to", other, "--again")
     assert (other / name).is_dir()

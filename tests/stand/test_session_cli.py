@@ -287,10 +287,10 @@ def test_a_replay_prints_steps_and_events_as_they_come(session: Path, speed: str
 
 
 def test_a_replay_gives_programs_steps_and_events_one_a_line(session: Path):
-    told = [json.loads(line) for line in ask("replay", session, "--speed", "max", "--json").stdout.splitlines()]
-    assert len(told) == 3 * COUNT
-    assert [each["kind"] for each in told[:3]] == ["Capture", "Capture", "note"]
-    assert (told[0]["state"], told[2]["text"]) == ("started", "half second 0, 5 µm")
+    reported = [json.loads(line) for line in ask("replay", session, "--speed", "max", "--json").stdout.splitlines()]
+    assert len(reported) == 3 * COUNT
+    assert [each["kind"] for each in reported[:3]] == ["Capture", "Capture", "note"]
+    assert (reported[0]["state"], reported[2]["text"]) == ("started", "half second 0, 5 µm")
 
 
 @pytest.mark.parametrize("speed", ["0", "-1", "fast", "nan", "1e9", ""])
@@ -391,7 +391,7 @@ def test_of_a_session_being_recorded_what_is_finished_is_used(session: Path, tmp
 
 @pytest.mark.parametrize(("command", "option"), USES)
 @pytest.mark.parametrize("series", ["frames", "telemetry"])
-def test_who_meets_damage_is_told_that_a_salvage_helps(
+def test_a_command_that_meets_damage_says_that_a_salvage_helps(
     session: Path, tmp_path: Path, series: str, command: str, option: str
 ):
     path = session / series / "0000.mcap"
@@ -428,6 +428,6 @@ def test_text_in_a_recording_cannot_write_to_the_terminal(session: Path):
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_a_file_that_may_not_be_read_is_told(session: Path):
+def test_a_file_that_may_not_be_read_is_reported(session: Path):
     (session / "frames" / "0000.mcap").chmod(0)
     assert "Permission" in ask("info", session).stdout

@@ -50,11 +50,14 @@ def table(path: Path) -> list[dict[str, str]]:
 def test_list_and_info_show_utc_and_durations_of_the_stands_clock(session: Path):
     listed = ask("list", session.parent).splitlines()[1].split()
     assert listed[2:6] == ["2026-01-01", "18:00:00", "5.5", "s"]
-    for told in (json.loads(ask("list", session.parent, "--json"))[0], json.loads(ask("info", session, "--json"))):
-        assert told["start"].startswith("2026-01-01T18:00:00.")
-        assert told["end"] == "2026-01-01T19:00:05.623456789Z"
-        assert (told["begin_ns"] // NS_PER_S, told["end_ns"]) == (START_NS // NS_PER_S, START_NS + 11 * NS_PER_S // 2)
-        assert told["duration_s"] < 6
+    for reported in (json.loads(ask("list", session.parent, "--json"))[0], json.loads(ask("info", session, "--json"))):
+        assert reported["start"].startswith("2026-01-01T18:00:00.")
+        assert reported["end"] == "2026-01-01T19:00:05.623456789Z"
+        assert (reported["begin_ns"] // NS_PER_S, reported["end_ns"]) == (
+            START_NS // NS_PER_S,
+            START_NS + 11 * NS_PER_S // 2,
+        )
+        assert reported["duration_s"] < 6
     lines = " ".join(ask("info", session).split())
     assert "recorded 2026-01-01 18:00:00 to 2026-01-01 19:00:05 UTC, 5.5 s, wall clock" in lines
     assert "2026-01-01 18:00:04 warning: half second 8" in lines
@@ -94,14 +97,14 @@ def test_a_part_is_cut_by_utc_and_knows_its_own(session: Path, tmp_path: Path):
     assert Session.open(part).frame_times_ns.tolist() == [START_NS + 5 * NS_PER_S - 50_000_000]
     assert Session.open(part).utc.at(START_NS + 5 * NS_PER_S) == HOUR_NS
     assert ask("list", tmp_path).splitlines()[1].split()[2:4] == ["2026-01-01", "19:00:05"]
-    (told,) = (event for event in Session.open(part).events() if event.kind == "session.trimmed")
-    assert "2026-01-01T19:00:05.000000000Z up to 2026-01-01T19:00:05.500000000Z" in told.text
+    (reported,) = (event for event in Session.open(part).events() if event.kind == "session.trimmed")
+    assert "2026-01-01T19:00:05.000000000Z up to 2026-01-01T19:00:05.500000000Z" in reported.text
     assert verify(part).is_sound
 
 
-def test_what_verify_finds_is_told_in_utc(session: Path, tmp_path: Path):
+def test_what_verify_finds_is_reported_in_utc(session: Path, tmp_path: Path):
     damaged = Path(shutil.copytree(session, tmp_path / "night"))
     for segment in sorted((damaged / "frames").iterdir())[-1:]:
         segment.unlink()
-    told = "\n".join(map(str, verify(damaged).findings))
-    assert "2026-01-01 18:00:04 to 2026-01-01 19:00:05 UTC" in told
+    reported = "\n".join(map(str, verify(damaged).findings))
+    assert "2026-01-01 18:00:04 to 2026-01-01 19:00:05 UTC" in reported

@@ -38,8 +38,8 @@ def life(tmp_path: Path, image: np.ndarray):
     def begin(chamber_degC: float = 24.0, start_ns: int = START_NS) -> Life:
         begun = Life(tmp_path, PLAN, start_ns, disk, chamber_degC)
         begun.stand.image = image
-        begun.told = []
-        begun.hub.subscribe(begun.told.append)
+        begun.reported = []
+        begun.hub.subscribe(begun.reported.append)
         begun.pv_degC = chamber_degC
         begun.call(lambda: setattr(begun, "polling", asyncio.create_task(poll(begun))))
         lives.append(begun)
@@ -66,27 +66,27 @@ def killed(life: Life) -> int:
 
 def soaked_s(life: Life) -> float | None:
     """How long the soak took in this life, None while it is not done."""
-    marks = [item for item in life.told if isinstance(item, StepMark) and item.kind == "SoakUntilSettled"]
+    marks = [item for item in life.reported if isinstance(item, StepMark) and item.kind == "SoakUntilSettled"]
     ends = [mark.time_ns for mark in marks if mark.state is StepState.DONE]
     return (ends[0] - marks[0].time_ns) / NS_PER_S if ends else None
 
 
-def told(life: Life) -> list[str]:
-    return [item.text for item in life.told if isinstance(item, Event) and item.kind in ("settled", "not_settled")]
+def reported(life: Life) -> list[str]:
+    return [item.text for item in life.reported if isinstance(item, Event) and item.kind in ("settled", "not_settled")]
 
 
 def test_a_camera_at_rest_is_settled_when_a_window_has_been_seen(life: Callable[..., Life]):
     here = life()
     here.passes(400.0)
     assert SOONEST_S < soaked_s(here) < LATEST_S
-    assert told(here)[0].startswith("settled after 5 min: camera +0.000")
+    assert reported(here)[0].startswith("settled after 5 min: camera +0.000")
     assert here.wrong == []
 
 
 def test_looks_wait_for_the_chamber(life: Callable[..., Life]):
     here = life(20.0)
     here.passes(600.0)
-    assert not [item for item in here.told if isinstance(item, Event)]
+    assert not [item for item in here.reported if isinstance(item, Event)]
     here.pv_degC = 24.1
     here.passes(400.0)
     assert 600.0 + SOONEST_S - 60.0 < soaked_s(here) < 600.0 + LATEST_S
@@ -101,7 +101,7 @@ def test_a_pause_keeps_what_was_earned_but_begins_a_new_window(life: Callable[..
     here.call(lambda: here.stand.gate.clear(OPERATOR))
     here.passes(400.0)
     assert 260.0 + SOONEST_S - 60.0 < soaked_s(here) < 260.0 + LATEST_S
-    assert told(here)[0].startswith("settled after 8 min")  # 200 s and a new window of looks
+    assert reported(here)[0].startswith("settled after 8 min")  # 200 s and a new window of looks
 
 
 def test_an_interlock_begins_a_new_window(life: Callable[..., Life]):
@@ -125,7 +125,7 @@ def test_a_killed_soak_goes_on_with_what_it_had_earned_and_a_new_window(life: Ca
     assert soaked_s(second) is None
     second.passes(200.0)
     assert soaked_s(second) is not None
-    assert told(second)[0].startswith("settled after 8 min")
+    assert reported(second)[0].startswith("settled after 8 min")
 
 
 def test_a_target_that_is_not_there_lets_the_soak_end_at_its_longest(life: Callable[..., Life]):
@@ -134,7 +134,7 @@ def test_a_target_that_is_not_there_lets_the_soak_end_at_its_longest(life: Calla
     here.passes(1900.0)
     assert 1800.0 <= soaked_s(here) < 1810.0
     text = "not settled after 30 min: the target was not seen often enough (the target was not found: "
-    assert told(here)[0].startswith(text)
+    assert reported(here)[0].startswith(text)
 
 
 def test_a_look_that_fails_begins_a_new_window(life: Callable[..., Life], image: np.ndarray):

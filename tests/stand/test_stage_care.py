@@ -1,4 +1,4 @@
-"""Home checks and approaches anew, against the fake controller on its wire; time is virtual."""
+"""Home checks and approaches made again, against the fake controller on its wire; time is virtual."""
 
 import math
 from collections.abc import AsyncIterator
@@ -55,96 +55,96 @@ each_kind = pytest.mark.parametrize("kind", ["linear", "rotary"])
 async def test_a_home_check_tells_lost_steps_in_units_and_steps(
     bench: Bench, lost_steps: float, expected: tuple[str, str]
 ) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.lost_steps = lost_steps
-    residual = await check_home(axis, told.hub, bench.clock)
+    residual = await check_home(axis, notes.hub, bench.clock)
     assert residual == pytest.approx(lost_steps * UNIT_PER_STEP[bench.kind], abs=1e-9)
-    assert told.events == [expected]
-    assert f"{residual:.5f} {'mm' if bench.kind == 'linear' else 'deg'} ({lost_steps:.2f} steps)" in told.text
+    assert notes.events == [expected]
+    assert f"{residual:.5f} {'mm' if bench.kind == 'linear' else 'deg'} ({lost_steps:.2f} steps)" in notes.text
     assert bench.mechanical == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["rotary"])
 @pytest.mark.parametrize("place", [-40.0, -5.0, 0.0, 12.0, 40.0])
 async def test_a_home_check_never_turns_the_table_round(bench: Bench, place: float) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(place)
     bench.trajectory, began_s = [], bench.now_s
-    await check_home(axis, told.hub, bench.clock)
-    assert told.events == [("info", "home_residual")]
+    await check_home(axis, notes.hub, bench.clock)
+    assert notes.events == [("info", "home_residual")]
     assert min(bench.trajectory) >= min(place, 0.0) - 1.01
     assert max(bench.trajectory) <= max(place, 16.0) + 0.01
     assert bench.now_s - began_s < 60.0
 
 
 async def test_the_limit_of_a_home_check_is_the_callers(bench: Bench) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.lost_steps = 4.0
-    await check_home(axis, told.hub, bench.clock, limit_steps=5.0)
-    assert told.events == [("info", "home_residual")]
+    await check_home(axis, notes.hub, bench.clock, limit_steps=5.0)
+    assert notes.events == [("info", "home_residual")]
 
 
 async def test_an_axis_without_scale_is_homed_and_has_no_residual(bench: Bench) -> None:
-    told = IdentityPoint()
+    notes = IdentityPoint()
     await bench.axis.open()
-    assert math.isnan(await check_home(bench.axis, told.hub, bench.clock))
+    assert math.isnan(await check_home(bench.axis, notes.hub, bench.clock))
     assert await bench.axis.homed()
-    assert told.events == [("warning", "homed")]
+    assert notes.events == [("warning", "homed")]
 
 
 async def test_a_stage_whose_motor_went_off_is_approached_again_from_below(bench: Bench) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(120))
     assert (await bench.position()).quality is Quality.STALE
     bench.trajectory = []
-    await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
+    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert (await bench.position()).quality is Quality.GOOD
     assert min(bench.trajectory) == pytest.approx(30.0 - OVERSHOOT["linear"], abs=0.01)
     assert bench.mechanical == pytest.approx(30.0, abs=1e-4)
-    assert told.events == [("info", "re-approached")]
-    assert "motor off" in told.text
+    assert notes.events == [("info", "re-approached")]
+    assert "motor off" in notes.text
 
 
 async def test_a_stage_with_current_in_its_place_is_left_alone(bench: Bench) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     moves = bench.tap.count("move")
-    await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
-    assert (bench.tap.count("move"), told.events) == (moves, [])
+    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
+    assert (bench.tap.count("move"), notes.events) == (moves, [])
 
 
 async def test_an_axis_the_plan_never_moved_is_left_alone(bench: Bench) -> None:
-    told = IdentityPoint()
+    notes = IdentityPoint()
     await bench.axis.open()
-    await ready({"linear": bench.axis}, {}, told.hub, bench.clock)
-    assert (bench.tap.count("move"), told.events) == (0, [])
+    await ready({"linear": bench.axis}, {}, notes.hub, bench.clock)
+    assert (bench.tap.count("move"), notes.events) == (0, [])
 
 
 async def test_a_stage_stopped_on_its_way_is_brought_to_its_place(bench: Bench) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(20.0)
-    await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
+    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert bench.mechanical == pytest.approx(30.0, abs=1e-4)
-    assert "stands at 20.0000 mm" in told.text
+    assert "stands at 20.0000 mm" in notes.text
 
 
 async def test_a_stage_that_lost_its_scale_is_homed_before_it_is_approached(bench: Bench) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.power_cycle()
-    await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
+    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert bench.mechanical == pytest.approx(30.0, abs=1e-4)
     assert (await bench.position()).value == pytest.approx(30.0, abs=1e-9)
-    assert "not homed" in told.text
+    assert "not homed" in notes.text
 
 
 async def test_an_alarm_is_not_moved_away(bench: Bench) -> None:
-    axis, told = await bench.ready(), IdentityPoint()
+    axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.alarm = True
     with pytest.raises(DeviceFault, match="alarm"):
-        await ready({"linear": axis}, {"linear": 30.0}, told.hub, bench.clock)
-    assert told.events == []
+        await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
+    assert notes.events == []

@@ -142,7 +142,7 @@ def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_
     assert not (tmp_path / "out").exists()
 
 
-def test_a_disk_that_is_too_small_for_the_plan_is_told_of():
+def test_a_disk_that_is_too_small_for_the_plan_is_reported():
     order = load_order("overnight", "simulated")
     steps = price(order.recipe.plan(), order.config)
     assert small_disk(11_000_000_000, steps, order.config) == (

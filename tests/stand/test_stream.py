@@ -53,7 +53,7 @@ async def test_a_viewer_gets_the_state_then_what_happens_in_order_with_numbers(t
         desk.tell("last")
         got = [await until(viewer, kind) for kind in ("event", "reading", "event", "event")]
         assert [each["seq"] for each in got] == list(range(state["seq"] + 1, state["seq"] + 5))
-        assert (got[0]["data"]["kind"], got[0]["data"]["data"]) == ("told", {"value": 1})
+        assert (got[0]["data"]["kind"], got[0]["data"]["data"]) == ("reported", {"value": 1})
         assert got[1]["data"]["readings"]["thermometers.air"]["value"] == 22.0
         assert got[1]["data"]["readings"]["thermometers.granite"]["value"] is None
         assert (got[2]["data"]["kind"], got[2]["data"]["data"]["step_id"]) == ("step", "3-soak")
@@ -80,7 +80,7 @@ async def test_a_command_is_an_event_with_its_number_and_who_gave_it(tmp_path: P
         assert (await until(viewer, "state"))["data"]["reasons"] == ["operator"]
 
 
-async def test_who_reconnects_gets_what_was_missed_and_is_told_what_is_gone(
+async def test_a_client_that_reconnects_gets_what_was_missed_and_learns_what_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(streams, "EVENTS", 10)
@@ -117,7 +117,7 @@ async def test_who_reconnects_gets_what_was_missed_and_is_told_what_is_gone(
         assert (found["gone"], [each["text"] for each in found["events"]]) == (False, ["16", "17", "18", "19"])
 
 
-async def test_a_viewer_who_does_not_read_loses_the_oldest_and_is_told_so():
+async def test_a_viewer_who_does_not_read_loses_the_oldest_and_learns_of_it():
     desk = ADesk()
     bridge = Bridge(desk, desk.hub, desk.clock)
     stream = Stream(bridge)

@@ -46,9 +46,9 @@ def test_a_token_is_made_listed_known_and_taken_back(config: Path):
 
 
 def test_without_a_file_in_the_configuration_it_is_said_where_to_name_one():
-    told = invoke("add", "rose")
-    assert told.exit_code == 2
-    assert "has no interface.secrets" in told.stderr
+    reported = invoke("add", "rose")
+    assert reported.exit_code == 2
+    assert "has no interface.secrets" in reported.stderr
     assert load_tokens(None) == {}
 
 

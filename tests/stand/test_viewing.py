@@ -46,7 +46,7 @@ async def session(tmp_path: Path) -> Path:
 
 
 class Looking:
-    """Finds no markers, and remembers which frame it was told to count drift from (as Previewer does)."""
+    """Finds no markers, and remembers which frame it was asked to count drift from (as Previewer does)."""
 
     def __init__(self) -> None:
         self._reference_ns: int | None = None
@@ -111,7 +111,7 @@ def test_the_reference_of_a_session_is_that_of_its_last_series(session: Path):
     assert (recalled.shot.as_reference, recalled.last_role) == (True, "fit")
 
 
-async def test_after_a_restart_drift_is_told_against_the_runs_own_reference(
+async def test_after_a_restart_drift_is_shown_against_the_runs_own_reference(
     session: Path, monkeypatch: pytest.MonkeyPatch
 ):
     async with viewing(str(session), session.parent, monkeypatch) as (found, hub):
@@ -122,19 +122,19 @@ async def test_after_a_restart_drift_is_told_against_the_runs_own_reference(
         assert again.reference_ns == START_NS + 200_000 * MS
 
 
-async def test_a_session_that_cannot_be_read_is_told_and_frames_are_looked_at(
+async def test_a_session_that_cannot_be_read_is_reported_and_frames_are_looked_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    told: list[str] = []
+    reported: list[str] = []
     async with viewing(str(tmp_path / "nothing"), tmp_path, monkeypatch) as (found, hub):
-        hub.subscribe(lambda item: told.append(item.text) if isinstance(item, Event) else None)
+        hub.subscribe(lambda item: reported.append(item.text) if isinstance(item, Event) else None)
         await looked_at(found, hub, START_NS, "fit")
-        assert told == []  # of a run that begins nothing is recorded yet
+        assert reported == []  # of a run that begins nothing is recorded yet
         hub.publish(Event(0, "info", "run.resume", "resumed"))
         preview = await looked_at(found, hub, START_NS + 1, "fit")
         assert preview.reference_ns == START_NS
         await asyncio.sleep(0)
-    assert "the run's own is not found" in told[-1]
+    assert "the run's own is not found" in reported[-1]
 
 
 def test_at_the_terminal_a_resumed_runs_drift_counts_from_its_own_reference_too(

@@ -1,4 +1,4 @@
-"""What whoever sits at the terminal sees of a run: lines and messages, from the run's own hub and from a daemon."""
+"""What a person at the terminal sees of a run: lines and messages, from the run's own hub and from a daemon."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_run_is_followed_from_its_first_step_on(follow: tuple[Follow, list[Mom
 def test_each_warning_says_what_to_type(follow: tuple[Follow, list[Moment], list[str]]):
     subscriber, moments, lines = follow
     subscriber(mark(0, 0, StepState.STARTED))
-    subscriber(Event(BEGIN_NS, "info", "told", "of no importance"))
+    subscriber(Event(BEGIN_NS, "info", "reported", "of no importance"))
     subscriber(Event(BEGIN_NS, "warning", "held", "held by an operator's pause", {"reason": "operator"}))
     subscriber(Batch("all", BEGIN_NS, ()))
     at = UtcOffsets().local_text(BEGIN_NS)[11:]
@@ -158,7 +158,7 @@ def test_the_same_is_one_line_in_a_log():
     )
 
 
-def test_a_stand_that_a_daemon_has_is_told_alike():
+def test_a_stand_that_a_daemon_has_is_shown_alike():
     air = ReadingState(value=23.98, unit="degC", quality="good", time_ns=BEGIN_NS)  # pyright: ignore[reportArgumentType]
     run = STATUS.model_copy(update={"end_within_s": 90.0, "frames_planned": 640, "reasons": ()})
     state = StandState(
@@ -195,9 +195,9 @@ def test_without_a_terminal_a_line_a_minute_and_in_virtual_time_one_at_each_tent
         clock.ns = BEGIN_NS + second * NS_PER_S
         lines.show(replace(MOMENT, share=second / 1200))
     lines.tell("warning: it\nis so")
-    told = capsys.readouterr().err.splitlines()
-    assert shown_shares(told[:-1]) == shares
-    assert told[-1] == "warning: it\\nis so"
+    reported = capsys.readouterr().err.splitlines()
+    assert shown_shares(reported[:-1]) == shares
+    assert reported[-1] == "warning: it\\nis so"
 
 
 def test_on_a_terminal_messages_stand_above_the_panel(monkeypatch: pytest.MonkeyPatch):

@@ -74,7 +74,7 @@ def require_aravis() -> None:
 def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[..., str]:
     """The installed simulated configuration at free addresses; keyword arguments replace whole sections' entries.
 
-    Frames show the upper left corner of the sensor; whoever needs the target says `camera=WHOLE_SENSOR`. Devices are
+    Frames show the upper left corner of the sensor; one that needs the target says `camera=WHOLE_SENSOR`. Devices are
     polled and guarded calmly, but in files that ask for another `POLLED`: those of the guard and the relays, whose
     subject is time. By night all have the whole sensor and are polled as installed.
     """

@@ -78,6 +78,6 @@ async def main(directory):
 if __name__ == "__main__":
     try:
         asyncio.run(main(Path(sys.argv[1])))
-    except SessionError as told:
-        sys.stderr.write(f"{told}\n")
+    except SessionError as error:
+        sys.stderr.write(f"{error}\n")
         sys.exit(3)

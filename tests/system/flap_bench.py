@@ -98,7 +98,7 @@ class Bench:
                 await asyncio.sleep(0)
 
     async def act_while_time_moves(self, by_s: float, action: Callable[[], Awaitable[object]]) -> None:
-        """Begin something from outside of virtual time, while the simulator is told of an instant that much ahead."""
+        """Begin something from outside of virtual time, while the simulator is set to an instant that much ahead."""
         self._while_advancing = action
         await self.wait(by_s)
         assert self._begun is not None

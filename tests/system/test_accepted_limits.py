@@ -50,8 +50,8 @@ def test_a_weakened_limit_is_refused_and_when_accepted_by_name_shown_at_each_sta
     assert run.exit_code == 0, run.stderr
     assert "guard.accept weakens the protection: compressor.min_off_s 60 (safe: at least 180 s)" in run.stderr
     events = Session.open(Path(run.stdout.strip())).events()
-    told = [(event.level, event.data) for event in events if event.kind == "limits_accepted"]
-    assert told == [("warning", {"compressor.min_off_s": 60.0})]
+    reported = [(event.level, event.data) for event in events if event.kind == "limits_accepted"]
+    assert reported == [("warning", {"compressor.min_off_s": 60.0})]
 
 
 def test_a_notify_program_that_does_not_exist_is_refused_where_a_run_would_begin_but_not_in_a_plan(

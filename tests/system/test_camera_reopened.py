@@ -1,5 +1,5 @@
-"""A camera that is lost in a soak, when no frame asks for it: opened again at once, and soaked anew when it has started
-anew meanwhile."""
+"""A camera that is lost in a soak, when no frame asks for it: opened again at once, and soaked again when it has
+restarted meanwhile."""
 
 import asyncio
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def temperatures_good(directory: Path) -> list[bool]:
 async def test_a_camera_that_was_cut_off_in_a_soak_is_opened_again_and_keeps_its_soak(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
-    # A camera that was switched on a second ago could not be told from one that has started anew meanwhile.
+    # A camera that was switched on a second ago could not be distinguished from one that has started again meanwhile.
     ordered = order(SOAK, **{**FAST, "camera": {"poll_s": 0.5, "boot_s": 2.5}})
     await asyncio.to_thread(simulator, ordered.config, False)
     async with heating(ordered, tmp_path / "out") as (_, watcher):
@@ -48,7 +48,7 @@ async def test_a_camera_that_was_cut_off_in_a_soak_is_opened_again_and_keeps_its
 
 
 @pytest.mark.nightly  # a minute of real time
-async def test_a_camera_that_started_anew_by_itself_in_a_soak_is_soaked_anew(
+async def test_a_camera_that_restarted_by_itself_in_a_soak_is_soaked_again(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
     ordered = order(SOAK, **FAST)

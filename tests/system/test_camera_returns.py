@@ -24,7 +24,7 @@ def _aravis() -> None:
 async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_has_one(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    # It answers at once: what is not there at all costs Aravis 10 s of real time.
+    # It answers at once: a camera that is absent costs Aravis 10 s of real time.
     ordered, lost, frames = order(SHORTER, camera={"boot_s": 0}), list[str](), list[Frame]()
 
     def follow(item: Item) -> None:
@@ -47,7 +47,7 @@ async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_
         len([meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]) == 3
     )
     kinds = [event.kind for event in session.events()]
-    assert "camera_equilibrium_lost" in kinds  # it has started anew: the frame before is taken again when it has soaked
+    assert "camera_equilibrium_lost" in kinds  # it has restarted: the frame before is taken again when it has soaked
     assert kinds.index("camera_equilibrium") > kinds.index("camera_equilibrium_lost")
     assert len(lost) == 2  # one hold until it gives frames, not one for each try: the flap is shut in it
     assert "stream channel" in lost[-1]

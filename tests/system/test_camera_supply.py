@@ -1,4 +1,4 @@
-"""A camera whose supply was off is soaked anew: what it was soaked before is not credited, and no frame is of a cold
+"""A camera whose supply was off is soaked again: what it was soaked before is not credited, and no frame is of a cold
 one."""
 
 import asyncio
@@ -78,15 +78,15 @@ async def test_a_soak_with_a_cold_camera_is_not_credited(tmp_path: Path, order: 
     check_soaked(session, lost.time_ns)
     entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
     earned = [(entry.time_ns, entry.earned_s) for entry in entries if isinstance(entry, Dwell)]
-    anew = [time_ns for time_ns, earned_s in earned if earned_s == 0.0]
-    assert len(anew) == 1
-    assert 0 <= anew[0] - lost.time_ns < 90 * NS_PER_S
-    assert max(earned_s for time_ns, earned_s in earned if time_ns < anew[0]) > 300.0
+    restarts = [time_ns for time_ns, earned_s in earned if earned_s == 0.0]
+    assert len(restarts) == 1
+    assert 0 <= restarts[0] - lost.time_ns < 90 * NS_PER_S
+    assert max(earned_s for time_ns, earned_s in earned if time_ns < restarts[0]) > 300.0
     powered_ns, powered = session.readings("relays.camera_power")
-    assert powered[powered_ns > anew[0] + 60 * NS_PER_S].min() == 1
+    assert powered[powered_ns > restarts[0] + 60 * NS_PER_S].min() == 1
 
 
-def test_after_a_power_cut_the_camera_is_soaked_anew_and_compared_with_itself(
+def test_after_a_power_cut_the_camera_is_soaked_again_and_compared_with_itself(
     tmp_path: Path, order: Callable[..., Order]
 ):
     """The laboratory that a run is resumed in has no camera on: its supply is found off."""

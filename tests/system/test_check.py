@@ -70,8 +70,8 @@ def test_without_moves_each_device_tells_what_it_is_and_the_record_goes_with_ses
     assert (status, verdicts(findings, "failed")) == (0, set())
     assert ("relays", "point version") in verdicts(findings, "unverified")
     assert ("regulator", "point mv_at_pv_error") in verdicts(findings, "ok")  # by what its map expects
-    told = {each["device"]: each["data"] for each in findings if each["what"] == "identity"}
-    assert {name: data["serial_number"] for name, data in told.items()} == {
+    reported = {each["device"]: each["data"] for each in findings if each["what"] == "identity"}
+    assert {name: data["serial_number"] for name, data in reported.items()} == {
         "regulator": "", "thermometers": "", "relays": "", "flap": "00351210", "linear": "4101", "rotary": "4102"
     }  # fmt: skip
     after = laboratory(config, {"do": "state"})
@@ -151,8 +151,8 @@ async def test_one_that_is_broken_off_switches_the_cameras_off_again_that_it_has
 
 
 async def test_a_stand_that_another_program_has_is_not_touched(config: Path, tmp_path: Path) -> None:
-    told: list[tuple[Finding, ...]] = []
+    reported: list[tuple[Finding, ...]] = []
     async with claimed(load_config(config), tmp_path / "session"):
         with pytest.raises(InUse, match=r"is in use by session .*; nothing was touched"):
-            await commission(load_config(config), told.append, has_moves=False)
-    assert told == []
+            await commission(load_config(config), reported.append, has_moves=False)
+    assert reported == []

@@ -1,4 +1,4 @@
-"""Warm-ups that are interrupted begin anew from a cold camera; prompts that somebody attends to are waited for."""
+"""Warm-ups that are interrupted begin again from a cold camera; prompts that somebody attends to are waited for."""
 
 import asyncio
 import itertools
@@ -41,14 +41,14 @@ def _aravis() -> None:
     require_aravis()
 
 
-def test_a_warm_up_that_was_killed_begins_anew_from_a_cold_camera(tmp_path: Path, order: Callable[..., Order]):
+def test_a_warm_up_that_was_killed_begins_again_from_a_cold_camera(tmp_path: Path, order: Callable[..., Order]):
     ordered = order(WARM_UP)
     daemon = Daemon(ordered, tmp_path / "out")
     assert daemon.lives_for(5, "Frame")
     daemon.kill()
     (directory,) = (tmp_path / "out").iterdir()
     daemon = Daemon(None, directory)
-    assert daemon.lives_for(2, "Frame")  # once more, in the warm-up that was begun anew
+    assert daemon.lives_for(2, "Frame")  # once more, in the warm-up that was begun again
     daemon.kill()
     assert Daemon(None, directory).wait() == 0
 
@@ -164,7 +164,7 @@ def acting(actions: dict[int, Callable[[], Awaitable[object]]], answer: Callable
     return (lambda hub: hub.subscribe(follow)), tasks, items
 
 
-async def test_a_warm_up_that_an_interlock_has_held_begins_anew_from_a_cold_camera(
+async def test_a_warm_up_that_an_interlock_has_held_begins_again_from_a_cold_camera(
     tmp_path: Path, order: Callable[..., Order]
 ):
     ordered, out = order(WARM_UP), tmp_path / "out"
@@ -234,7 +234,7 @@ async def test_a_warm_up_that_is_paused_shortly_goes_on_and_says_what_was_not_se
     assert not [event for event in session.events() if event.kind == "capture_restarted"]
 
 
-async def test_a_warm_up_that_is_paused_for_long_begins_anew_from_its_cool_down(
+async def test_a_warm_up_that_is_paused_for_long_begins_again_from_its_cool_down(
     tmp_path: Path, order: Callable[..., Order]
 ):
     ordered = order(WARM_UP, **AS_INSTALLED)

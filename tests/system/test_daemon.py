@@ -79,7 +79,7 @@ class Served:
     def submit(self, recipe: str, key: str = "", **more: object) -> dict[str, object]:
         return self.post("queue", recipe_text=recipe, key=key, **more)
 
-    def told(self) -> str:
+    def reported(self) -> str:
         """What it said, after its end."""
         return self.process.communicate(timeout=LIMIT_S)[0]
 
@@ -107,7 +107,7 @@ def states_of(state: StandState) -> list[str]:
     return [run.state for run in state.queue]
 
 
-def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve: Callable[[], Served]):
+def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(serve: Callable[[], Served]):
     served = serve()
     idle = served.until(is_idle)
     assert idle.run is None
@@ -151,8 +151,8 @@ def test_a_served_stand_runs_what_is_queued_and_is_told_by_hand_in_between(serve
     assert counters["flap_cycles"] >= 1
     assert counters["stage_cycles.linear"] >= 1
     served.process.send_signal(signal.SIGTERM)
-    told = served.told()
-    assert served.process.returncode == 0, told
+    reported = served.reported()
+    assert served.process.returncode == 0, reported
     (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
     session = Session.open(folder)
     assert session.incomplete == ()
@@ -221,10 +221,10 @@ def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
     with pytest.raises(subprocess.TimeoutExpired):
         follower.wait(1.0)  # it looks twice a second
     again.process.send_signal(signal.SIGTERM)
-    told = again.told()
+    reported = again.reported()
     follower.kill()
     follower.communicate()
-    assert again.process.returncode == 0, told
+    assert again.process.returncode == 0, reported
     kinds = [event.kind for event in Session.open(again.out / session).events()]
     assert "run.resume" in kinds
 
@@ -259,9 +259,9 @@ def test_a_second_daemon_and_a_second_run_touch_nothing(serve: Callable[[], Serv
     served = serve()
     served.until(is_idle)
     second = Served(laboratory, tmp_path / "other")
-    told = second.told()
+    reported = second.reported()
     assert second.process.returncode == 1
-    assert "in use by the daemon of `stand serve`" in told
+    assert "in use by the daemon of `stand serve`" in reported
     assert served.state().fault is None
 
 
@@ -272,8 +272,8 @@ def test_the_end_of_the_daemon_ends_its_run_which_may_be_resumed(serve: Callable
     served.until(lambda state: state.run is not None and state.heater_permitted)
     began_s = time.monotonic()
     served.process.send_signal(signal.SIGTERM)
-    told = served.told()
-    assert served.process.returncode == 0, told
+    reported = served.reported()
+    assert served.process.returncode == 0, reported
     assert time.monotonic() - began_s < 30.0
     assert states_of(serve().until(is_idle)) == ["interrupted"]
 
@@ -357,7 +357,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
     texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
     day = ["20261122"]
     monkeypatch.setattr(DayRecord, "_today", lambda _: day[0])
-    told: list[Event] = []
+    reported: list[Event] = []
 
     @asynccontextmanager
     async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
@@ -369,7 +369,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
                     await asyncio.sleep(0.02)
 
         async def work() -> None:
-            hub.subscribe(lambda item: told.append(item) if isinstance(item, Event) else None)
+            hub.subscribe(lambda item: reported.append(item) if isinstance(item, Event) else None)
             await desk.device(who, "regulator", "set", {"setpoint_degC": 40.0})
             await until(lambda: desk.state().heater_permitted)
             day[0] = "20261123"
@@ -387,7 +387,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
 
     await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
     # On a busy machine a poll may take longer than its period.
-    assert {event.kind for event in told if event.level != "info"} <= {"device_slow"}
+    assert {event.kind for event in reported if event.level != "info"} <= {"device_slow"}
     first, second = (
         Session.open(out / f"{name}-house").readings("regulator.pv")[0] for name in ("20261122", "20261123")
     )

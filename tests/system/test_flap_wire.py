@@ -290,7 +290,7 @@ async def test_made_safe_while_its_settings_are_read_an_opening_sends_no_target(
 
 
 async def test_a_stop_that_comes_while_time_is_being_moved_is_no_jam(bench: Bench, flap: Flap) -> None:
-    """A signal is served whenever it comes: here while the simulator is told of a time 2 s ahead. The flap, told to
+    """A signal is served whenever it comes: here while the simulator is set to a time 2 s ahead. The flap, asked to
     close at that time, still stands open then, and has had no time to move."""
     await flap.move_open()
     await bench.act_while_time_moves(2.0, flap.make_safe)

@@ -1,4 +1,4 @@
-"""The guard in whole runs, over every wire in virtual time: a trip is latched, made safe, recorded, noted and told, and
+"""The guard in whole runs, over every wire in virtual time: a trip is latched, made safe, recorded, noted and sent, and
 only an operator clears it."""
 
 import asyncio
@@ -134,8 +134,8 @@ def once_warm(action: Callable[[], object]) -> Callable[[Hub], None]:
 async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_operator_may_resume_it(
     tmp_path: Path, order: Callable[..., Order], name: str, value: object, rule: str, text: str
 ):
-    told, tasks = tmp_path / "told", list[asyncio.Task[None]]()
-    ordered = telling(order(LONG_SOAK, bus={"timeout_s": 0.1}), told)
+    reported, tasks = tmp_path / "reported", list[asyncio.Task[None]]()
+    ordered = telling(order(LONG_SOAK, bus={"timeout_s": 0.1}), reported)
     begins = once_warm if name == "heater.cut_out" else partial(at_step, "Soak")  # the first heat has its own rule
     watch = begins(lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))
     with pytest.raises(StandTripped) as caught:
@@ -147,7 +147,7 @@ async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_opera
     assert (trip.level, trip.kind) == ("error", f"guard.{rule}")
     assert text in trip.text
     assert str(caught.value) == f"{trip.text}; the stand is safe"
-    assert told.read_text() == f"{trip.text}\n"
+    assert reported.read_text() == f"{trip.text}\n"
     assert trips_of(directory) == [rule]
     if name != "thermometers.silent":
         check_safe(session)
@@ -191,8 +191,8 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
 ):
     """It holds, stays held when its cause is gone, and is cleared over the socket."""
     rule, breaks, mends = TO_BE_PUT_RIGHT[name]
-    told, out, watcher = tmp_path / "told", tmp_path / "out", Watcher()
-    ordered = telling(order(LONG_SOAK), told)
+    reported, out, watcher = tmp_path / "reported", tmp_path / "out", Watcher()
+    ordered = telling(order(LONG_SOAK), reported)
 
     async def do(what: object, value: object) -> None:
         if isinstance(what, str):
@@ -227,7 +227,7 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
     check_safe(session)
     trips = [event for event in session.events() if event.kind.startswith("guard.") and event.level == "error"]
     assert [trip.kind for trip in trips] == [f"guard.{rule}"] * (2 if rule == "stage_alarm" else 1)
-    assert told.read_text().splitlines() == [trip.text for trip in trips]
+    assert reported.read_text().splitlines() == [trip.text for trip in trips]
     assert [entry for entry in trips_of(directory) if entry != "cleared"] == [rule] * len(trips)
     assert trips_of(directory).count("cleared") == len(trips)
 
@@ -235,7 +235,7 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
 async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_room(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    ordered, watcher, out = telling(order(LONG_SOAK), tmp_path / "told"), Watcher(), tmp_path / "out"
+    ordered, watcher, out = telling(order(LONG_SOAK), tmp_path / "reported"), Watcher(), tmp_path / "out"
     recording = ordered.config.recording.model_copy(update={"stop_frames_below_GB": 1e9})
     ordered = replace(ordered, config=ordered.config.model_copy(update={"recording": recording}))
 
@@ -249,7 +249,7 @@ async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_ro
         await asyncio.to_thread(ask, directory, "stop")
 
     await run_operated(ordered, out, watcher, operate())
-    assert len((tmp_path / "told").read_text().splitlines()) == 2
+    assert len((tmp_path / "reported").read_text().splitlines()) == 2
 
 
 async def test_a_terminal_that_is_closed_leaves_the_stand_safe(tmp_path: Path, order: Callable[..., Order]):
@@ -264,7 +264,7 @@ async def test_a_terminal_that_is_closed_leaves_the_stand_safe(tmp_path: Path, o
 async def test_a_poller_or_listener_that_fails_unexpectedly_leaves_the_stand_safe(
     tmp_path: Path, order: Callable[..., Order], who: str
 ):
-    """Whoever listens fails at a reading, in the poller's task, and at the end of the run."""
+    """A listener fails at a reading, in the poller's task, and at the end of the run."""
     failing = list[bool]()
 
     def listen(item: Item) -> None:

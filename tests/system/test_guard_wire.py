@@ -289,7 +289,7 @@ async def test_a_relay_board_that_stays_silent_holds_the_stand(order: Callable[.
         assert trip.text.startswith("relays.heater_enable is BAD")
 
 
-async def test_what_somebody_left_switched_on_is_switched_off_and_told_before_anything_else(
+async def test_what_somebody_left_switched_on_is_switched_off_and_reported_before_anything_else(
     tmp_path: Path, order: Callable[..., Order], simulator: Start
 ):
     """Relays that are on for good, a running regulator and its old set-point; the compressor's rest begins now,

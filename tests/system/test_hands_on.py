@@ -1,4 +1,4 @@
-"""`stand device` on a stand that no daemon has: what a device is told, through the same gate, and left as it was."""
+"""`stand device` on a stand that no daemon has: what a device is asked, through the same gate, and left as it was."""
 
 import json
 from collections.abc import Callable
@@ -23,13 +23,13 @@ def tell(tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., S
     config = tmp_path / "config.yaml"
     simulator(load_config(config), False)
 
-    def told(*words: object) -> Result:
+    def asked(*words: object) -> Result:
         return CliRunner().invoke(app, ["device", *map(str, words), "--config", str(config), "--json"])
 
-    return told
+    return asked
 
 
-def test_devices_are_told_things_by_hand_and_left_safe(tell: Callable[..., Result], tmp_path: Path):
+def test_devices_are_operated_by_hand_and_left_safe(tell: Callable[..., Result], tmp_path: Path):
     devices = {each["name"]: [verb["verb"] for verb in each["verbs"]] for each in json.loads(tell().stdout)}
     assert list(devices)[:2] == ["regulator", "relays"]
     assert (devices["thermometers"], devices["flap"]) == (["read", "registers"], ["read", "open", "close"])

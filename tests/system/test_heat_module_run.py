@@ -58,7 +58,9 @@ async def test_it_holds_a_set_point_and_gives_nothing_without_permission(tmp_pat
         assert stand.trips() == []
 
 
-async def test_a_module_that_is_gone_for_longer_than_its_watchdog_holds_the_stand_and_its_trip_is_told(tmp_path: Path):
+async def test_a_module_that_is_gone_for_longer_than_its_watchdog_holds_the_stand_and_its_trip_is_reported(
+    tmp_path: Path,
+):
     async with virtual_stand(load_config(stand_file(tmp_path, bus={"timeout_s": 0.1}))) as stand:
         await stand.hold(40, 60)
         await stand.break_("heat_module.silent", True)

@@ -89,10 +89,10 @@ async def test_a_suspend_and_a_step_of_the_system_clock_are_recorded_and_instant
     times_ns = session.readings("regulator.pv")[0]
     assert np.all(np.diff(times_ns) > 0)
     assert times_ns[-1] - times_ns[0] > seconds_ns(40)
-    told = json.loads(CliRunner().invoke(app, ["info", str(directory), "--json"]).stdout)
-    assert told["duration_s"] > 40
-    assert told["end"] < told["start"]  # as the system clock had it
-    assert told["end_ns"] > told["begin_ns"]
+    reported = json.loads(CliRunner().invoke(app, ["info", str(directory), "--json"]).stdout)
+    assert reported["duration_s"] > 40
+    assert reported["end"] < reported["start"]  # as the system clock had it
+    assert reported["end_ns"] > reported["begin_ns"]
 
 
 class Host:

@@ -16,7 +16,7 @@ from tests.system.test_resume import check, check_soaks, revived
 
 LIFE_S = 20.0
 SET_POINTS = [30, 20, 24, 32, 20, 28, 22, 34, 26, 20, 30, 24] * 4
-# A dwell fits into one life also on a machine that others load: a chamber that was left alone has to soak anew.
+# A dwell fits into one life also on a machine that others load: a chamber that was left alone has to soak again.
 NIGHT = (
     SHORT_RECIPE.replace("600", "300")
     .replace("[30, 20, 24]", str(SET_POINTS))

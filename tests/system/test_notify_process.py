@@ -1,4 +1,4 @@
-"""Somebody is told whatever state the daemon is in, by a small process that goes with it."""
+"""Somebody is notified whatever state the daemon is in, by a small process that goes with it."""
 
 import asyncio
 import os
@@ -18,12 +18,12 @@ LIMIT_S = 60.0  # for what takes milliseconds, on a machine that has other thing
 
 
 class Daemon:
-    """It tells each sentence by a line in the file `told`, after `nap_s`."""
+    """It tells each sentence by a line in the file `reported`, after `nap_s`."""
 
-    def __init__(self, told, nap_s=0.0):
+    def __init__(self, reported, nap_s=0.0):
         script = f'sleep {nap_s}; printf "%s\\n" "$1" >> "$0"'
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.system.notify_daemon", "/bin/sh", "-c", script, str(told)],
+            [sys.executable, "-m", "tests.system.notify_daemon", "/bin/sh", "-c", script, str(reported)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -56,7 +56,7 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path):
-    daemon = Daemon(tmp_path / "told")
+    daemon = Daemon(tmp_path / "reported")
     yield daemon
     daemon.close()
 
@@ -75,24 +75,24 @@ def gone(pid):
 
 def test_a_daemon_that_has_no_descriptor_left_still_tells(daemon, tmp_path):
     assert daemon.tell("too warm!") == ""
-    assert (tmp_path / "told").read_text() == "too warm!\n"
+    assert (tmp_path / "reported").read_text() == "too warm!\n"
 
 
-def test_a_process_that_was_killed_is_replaced_when_something_is_to_be_told(daemon, tmp_path):
+def test_a_process_that_was_killed_is_replaced_when_something_is_to_be_reported(daemon, tmp_path):
     os.kill(daemon.pid, signal.SIGKILL)
     assert daemon.tell("too warm") == ""
-    assert (tmp_path / "told").read_text() == "too warm\n"
+    assert (tmp_path / "reported").read_text() == "too warm\n"
 
 
 def test_a_process_that_cannot_be_replaced_is_a_sentence_and_tried_again_the_next_time(daemon, tmp_path):
     os.kill(daemon.pid, signal.SIGKILL)
     assert daemon.tell("too warm!") == "/bin/sh could not be started ([Errno 24] Too many open files)"
     assert daemon.tell("too cold") == ""
-    assert (tmp_path / "told").read_text() == "too cold\n"
+    assert (tmp_path / "reported").read_text() == "too cold\n"
 
 
 async def test_a_slow_command_delays_no_other(tmp_path):
-    """The first two end only when the third has told."""
+    """The first two end only when the third has reported."""
     script = 'case "$1" in slow*) until [ -e "$0" ]; do sleep 0.05; done;; *) : > "$0";; esac'
     notifier = Notifier(("/bin/sh", "-c", script, str(tmp_path / "third")), LIMIT_S, WallClock())
     try:
@@ -105,14 +105,14 @@ async def test_a_slow_command_delays_no_other(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_process_ends_with_its_daemon_and_what_was_under_way_is_told(tmp_path, number):
-    daemon = Daemon(tmp_path / "told", nap_s=0.5)
+def test_the_process_ends_with_its_daemon_and_what_was_under_way_is_reported(tmp_path, number):
+    daemon = Daemon(tmp_path / "reported", nap_s=0.5)
     daemon.send("too warm")
     until(lambda: Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").exists() and children(daemon.pid))
     daemon.process.send_signal(number)
     daemon.process.wait(LIMIT_S)
     until(lambda: gone(daemon.pid))
-    assert (tmp_path / "told").read_text() == "too warm\n"
+    assert (tmp_path / "reported").read_text() == "too warm\n"
     daemon.close()
 
 

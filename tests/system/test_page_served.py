@@ -68,7 +68,7 @@ async def test_a_night_is_begun_watched_paused_and_stopped_in_a_browser(served_p
         await page.get_by_text("Roll the camera by 20 degrees").first.wait_for()
         await page.get_by_role("button", name="Done, go on").click()
         await page.get_by_text("The run waits for you").wait_for(state="detached")
-        # This laboratory's camera sees a part of the target, in the dark: it is told why no marker is found.
+        # This laboratory's camera sees a part of the target, in the dark: the page says why no marker is found.
         await page.locator(".frame + .facts", has_text="markers found").wait_for()
         await page.get_by_text(", reference").wait_for()
         await page.goto(f"http://127.0.0.1:{port}/#plan")

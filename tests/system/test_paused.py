@@ -1,4 +1,4 @@
-"""A pause, over the wires: what still moves is told, and after its limit the stand is made safe and held."""
+"""A pause, over the wires: what still moves is reported, and after its limit the stand is made safe and held."""
 
 import asyncio
 from collections.abc import Callable

@@ -54,7 +54,7 @@ def read_after_cut(image, at):
 
 
 def power_cut(start, tmp_path, name, wait_s, synced=False):
-    """Record, cut, and read what is left: whether the cut took what was not synced. Whoever calls `sync` on this
+    """Record, cut, and read what is left: whether the cut took what was not synced. Any other that calls `sync` on this
     machine meanwhile (`synced`: this test does) has put that on the disk, too."""
     image, after = tmp_path / "disk", tmp_path / f"disk-{name}"
     with image.open("wb") as file:

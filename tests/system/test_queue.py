@@ -52,7 +52,7 @@ def kill_under_way(directory: Path) -> None:
 
 
 def kill_at_once(directory: Path) -> None:
-    """Start the queue and kill it when it has told that its run goes on."""
+    """Start the queue and kill it when it has reported that its run goes on."""
     with forked.popen([*COMMAND, str(directory)], stderr=subprocess.PIPE, text=True) as daemon:
         assert daemon.stderr is not None
         assert "is resumed in" in daemon.stderr.readline()

@@ -58,7 +58,7 @@ def test_what_is_kept_and_what_is_replaced(tmp_path: Path):
     assert rehearsed(found) == found
 
 
-def test_an_axis_that_the_laboratory_does_not_have_is_told(tmp_path: Path):
+def test_an_axis_that_the_laboratory_does_not_have_is_reported(tmp_path: Path):
     data = yaml.safe_load(packaged("", "laboratory").read_text())
     axes = {"linear": data["axes"]["linear"], "tilt": data["axes"]["rotary"]}
     path = real_stand(tmp_path, axes=axes)

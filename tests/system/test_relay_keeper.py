@@ -1,4 +1,4 @@
-"""What the relays read is compared with what they were told: over the wire, with another master and brown-outs."""
+"""What the relays read is compared with what they were commanded: over the wire, with another master and brown-outs."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -64,7 +64,7 @@ async def test_a_compressor_whose_relay_is_dropped_by_somebody_else_has_stopped_
     await bench.end()
 
 
-async def test_a_brown_out_of_the_board_drops_the_heater_and_it_is_permitted_again_and_told(bench: Bench):
+async def test_a_brown_out_of_the_board_drops_the_heater_and_it_is_permitted_again_and_reported(bench: Bench):
     await bench.start(26, 60)
     await bench.fault("relays.brown_out", True)
     await seconds_until(bench, "heater_enabled", 1, 10)
@@ -88,8 +88,8 @@ async def test_what_somebody_switches_on_in_a_hold_is_off_within_5_s_and_latched
     bench.trips.clear()
     await another_master(bench, RELAYS, 5, HEATER, ON)
     assert await seconds_until(bench, "heater_enabled", 0, 20) <= 5
-    (told,) = [event for event in bench.events if event.kind == "switched_off"]
-    assert (told.level, told.data["relay"]) == ("warning", "heater_enable")
+    (reported,) = [event for event in bench.events if event.kind == "switched_off"]
+    assert (reported.level, reported.data["relay"]) == ("warning", "heater_enable")
     await another_master(bench, REGULATOR, 6, 0x0000, 0x0100)  # run
     await bench.wait(5.5)
     readings = {reading.channel: reading.value for reading in await bench.assembly.devices.regulator.read()}
@@ -100,7 +100,7 @@ async def test_what_somebody_switches_on_in_a_hold_is_off_within_5_s_and_latched
     await bench.end()
 
 
-async def test_whoever_switches_heat_on_twice_without_permission_holds_the_run(bench: Bench):
+async def test_another_master_that_switches_heat_on_twice_without_permission_holds_the_run(bench: Bench):
     """Idle, before the chamber is started or after it was stopped; nothing else is wrong."""
     await bench.start(26, 60)
     await bench.assembly.stand.chamber.stop()
@@ -116,8 +116,8 @@ async def test_whoever_switches_heat_on_twice_without_permission_holds_the_run(b
 async def test_a_board_that_is_suited_passes_the_test_of_its_timer(bench: Bench):
     await bench.assembly.stand.chamber.permits.withdraw_left_on()
     await bench.assembly.stand.chamber.test_dead_man()
-    (told,) = [event for event in bench.events if event.kind == "dead_man_tested"]
-    assert (told.level, told.data["rearmed"], told.data["dropped"]) == ("info", True, True)
+    (reported,) = [event for event in bench.events if event.kind == "dead_man_tested"]
+    assert (reported.level, reported.data["rearmed"], reported.data["dropped"]) == ("info", True, True)
     assert await bench.plant("heater_enabled") == 0
 
 
@@ -131,8 +131,8 @@ async def test_a_board_that_is_not_suited_is_refused_with_the_reason(bench: Benc
     with pytest.raises(DeviceFault, match=reason):
         await bench.assembly.stand.chamber.test_dead_man()
     assert await bench.plant("heater_enabled") == 0
-    (told,) = [event for event in bench.events if event.kind == "dead_man_tested"]
-    assert told.level == "error"
+    (reported,) = [event for event in bench.events if event.kind == "dead_man_tested"]
+    assert reported.level == "error"
 
 
 class SilentCamera:

@@ -115,7 +115,7 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
 
 
 def check_soaks(directory: Path, order: Order) -> None:
-    """Each soak was earned in slices of at most a minute without a break since it was last begun anew."""
+    """Each soak was earned in slices of at most a minute without a break since it was last begun again."""
     entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
     durations_s = {p.step_id: getattr(p.step, "duration_s", 0.0) for p in order.recipe.plan()}
     earned_s: dict[str, float] = {}
@@ -142,7 +142,7 @@ def test_a_night_killed_at_three_random_moments_is_one_whole_session(tmp_path: P
 
 
 def test_a_capture_that_was_killed_is_completed_at_its_temperature(tmp_path: Path, order: Callable[..., Order]):
-    """In the second capture, at 30 degC: the chamber that the next daemon finds has to soak anew first."""
+    """In the second capture, at 30 degC: the chamber that the next daemon finds has to soak again first."""
     ordered = order(NIGHT.replace("[30, 20, 24]", "[30]").replace("[20]", "[]"))
     directory, acknowledged = killed_and_resumed(ordered, tmp_path / "out", [(2 + 3, "Frame")])
     session = check(directory, ordered, acknowledged)

@@ -58,7 +58,7 @@ def stopped(kind: str = "Soak") -> Callable[..., None]:
 def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_said_and_recorded(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    """The resumed run trips, of which the session's notify program would be told; then it is resumed to its end."""
+    """The resumed run trips, of which the session's notify program would be notified; then it is resumed to its end."""
     trace, state, tasks = tmp_path / "was-run", tmp_path / "compressor.json", list[asyncio.Task[None]]()
     hostile = order(
         CAPTURES,
@@ -171,7 +171,7 @@ def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp
     assert 'guard.notify is [] as on this stand, not ["/bin/rm", "-r", "/"] as in the session' in said
 
 
-def test_a_thermometer_that_was_renamed_is_told_as_one_that_came_and_one_that_went(tmp_path: Path):
+def test_a_thermometer_that_was_renamed_is_reported_as_one_that_came_and_one_that_went(tmp_path: Path):
     session = config_of(tmp_path)
     named = {"lens" if name == "artifact" else name: each for name, each in session.thermometers.items()}
     own = session.model_copy(update={"thermometers": named})

@@ -1,4 +1,4 @@
-"""How runs end that nobody stopped: somebody is told, what was before the recording is in it, and nothing is left."""
+"""How runs end that nobody stopped: somebody is warned, what was before the recording is in it, and nothing is left."""
 
 import asyncio
 import gc
@@ -66,19 +66,19 @@ async def test_a_session_says_which_package_has_made_steps_of_its_plan(
     assert start.data["packages"] == ["acme 1.2"]
 
 
-async def test_somebody_is_told_of_a_step_that_fails(tmp_path: Path, order: Callable[..., Order]):
-    told, ordered = tmp_path / "told", order(SHORTER)
+async def test_somebody_is_notified_of_a_step_that_fails(tmp_path: Path, order: Callable[..., Order]):
+    reported, ordered = tmp_path / "reported", order(SHORTER)
     watch = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
     with pytest.raises(DeviceFault) as caught:
-        await run_virtual(telling(ordered, told), tmp_path / "out", None, watch)
+        await run_virtual(telling(ordered, reported), tmp_path / "out", None, watch)
     (directory,) = (tmp_path / "out").iterdir()
-    assert told.read_text() == f"{directory.name} has failed: {caught.value}\n"
+    assert reported.read_text() == f"{directory.name} has failed: {caught.value}\n"
 
 
 async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_complete_run(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    told, ordered = tmp_path / "told", order(SHORTER, bus={"timeout_s": 0.05}, guard={"safe_limit_s": 2})
+    reported, ordered = tmp_path / "reported", order(SHORTER, bus={"timeout_s": 0.05}, guard={"safe_limit_s": 2})
     last = list(ordered.recipe.plan())[-1].step_id
 
     def follow(item: Item) -> None:
@@ -86,17 +86,17 @@ async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_comp
             break_now(ordered, "bus.silent", True)
 
     with pytest.raises(StandTripped, match=r"complete, but NOT SAFE: .*regulator did not confirm its safe state"):
-        await run_virtual(telling(ordered, told), tmp_path / "out", None, lambda hub: hub.subscribe(follow))
-    (line,) = told.read_text().splitlines()
+        await run_virtual(telling(ordered, reported), tmp_path / "out", None, lambda hub: hub.subscribe(follow))
+    (line,) = reported.read_text().splitlines()
     assert line.count("NOT SAFE") == 1
 
 
-async def test_nobody_is_told_of_a_run_that_the_operator_stopped(tmp_path: Path, order: Callable[..., Order]):
-    told = tmp_path / "told"
+async def test_nobody_is_notified_of_a_run_that_the_operator_stopped(tmp_path: Path, order: Callable[..., Order]):
+    reported = tmp_path / "reported"
     stop = at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):
-        await run_virtual(telling(order(SHORTER), told), tmp_path / "out", None, stop)
-    assert not told.exists()
+        await run_virtual(telling(order(SHORTER), reported), tmp_path / "out", None, stop)
+    assert not reported.exists()
 
 
 async def test_what_happened_before_the_recording_began_is_in_it(tmp_path: Path, order: Callable[..., Order]):

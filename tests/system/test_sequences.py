@@ -124,14 +124,14 @@ def check_places(session: Session) -> None:
 
 
 def check_relaxed_stages_came_back(session: Session) -> None:
-    """90 s after its move the linear stage has no current: those captures approach it anew; the rotary one has some."""
+    """90 s after its move the linear stage has no current: those captures approach again; the rotary one has some."""
     texts = [event.text for event in session.events() if event.kind == "re-approached"]
     assert len(texts) == 3
     assert all(text.startswith("linear: motor off") for text in texts)
 
 
 def check_no_drift_is_fitted_to_them(session: Session) -> None:
-    """Whoever looks for the frames of the drift finds none, but the warm-up's."""
+    """A search for the frames of the drift finds none, but the warm-up's."""
     observed = observe([session.path], progress)
     cycle = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
     assert observed.of(*cycle).sum() == 0

@@ -79,7 +79,7 @@ def test_whichever_disk_process_is_killed_no_heat_goes_on_without_what_it_did(be
     served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
     os.kill(disk_processes(served)[0], signal.SIGKILL)
     assert served.process.wait(LIMIT_S) == 1
-    assert "writes the session to the disk has ended (killed by SIGKILL); neither queue nor" in served.told()
+    assert "writes the session to the disk has ended (killed by SIGKILL); neither queue nor" in served.reported()
     assert begin().until(is_idle).readings["relays.heater_enable"].value == 0
 
 
@@ -130,8 +130,8 @@ def test_a_hung_disk_holds_the_stand_over_a_stop_of_the_process_and_keeps_nobody
     served.process.wait(LEAVES_WITHIN_S)
     assert time.monotonic() - began_s < LEAVES_WITHIN_S
     assert served.process.returncode == 0
-    told = served.told()
-    assert "Traceback" not in told
-    assert "the stand is held no longer" not in told  # the disk still hangs
-    assert "the recording ended while the disk held it up" in told
-    assert "the queue does not know it yet" in told
+    reported = served.reported()
+    assert "Traceback" not in reported
+    assert "the stand is held no longer" not in reported  # the disk still hangs
+    assert "the recording ended while the disk held it up" in reported
+    assert "the queue does not know it yet" in reported

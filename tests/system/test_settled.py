@@ -44,9 +44,9 @@ pytestmark = pytest.mark.usefixtures("_aravis")
 
 async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: Path, order: Callable[..., Order]):
     session = Session.open(await run_virtual(order(RECIPE, camera=WHOLE_SENSOR), tmp_path, 3, lambda _: None))
-    told = [event.text for event in session.events() if event.kind == "settled"]
-    assert len(told) == 1
-    assert all("K/min" in text and "mpx/min" in text for text in told)
+    reported = [event.text for event in session.events() if event.kind == "settled"]
+    assert len(reported) == 1
+    assert all("K/min" in text and "mpx/min" in text for text in reported)
     soaks = [mark for mark in session.steps() if mark.kind == "SoakUntilSettled"]
     assert [mark.state for mark in soaks] == [StepState.STARTED, StepState.DONE]
     begin, end = soaks
@@ -76,8 +76,8 @@ def check_looks_are_not_fitted(observed: Observations) -> None:
 
 async def test_a_dwell_that_never_settles_ends_at_its_longest_and_says_so(tmp_path: Path, order: Callable[..., Order]):
     session = Session.open(await run_virtual(order(NEVER), tmp_path, 3, lambda _: None))
-    told = [event for event in session.events() if event.kind in ("settled", "not_settled")]
-    assert [(event.kind, event.level) for event in told] == [("not_settled", "warning")]
-    assert told[0].text.startswith("not settled after 15 min: ")
+    reported = [event for event in session.events() if event.kind in ("settled", "not_settled")]
+    assert [(event.kind, event.level) for event in reported] == [("not_settled", "warning")]
+    assert reported[0].text.startswith("not settled after 15 min: ")
     begin, end = (mark for mark in session.steps() if mark.kind == "SoakUntilSettled")
     assert 900.0 <= (end.time_ns - begin.time_ns) / NS_PER_S < 915.0

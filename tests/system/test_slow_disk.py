@@ -56,7 +56,7 @@ async def test_a_frozen_disk_costs_counted_frames_and_neither_telemetry_nor_time
     run("fsfreeze", "-f", disk)
     try:
         late_s = await publish(hub, clock, 50, FROZEN_TICKS)
-        told_meanwhile = [event.text for event in events]
+        reported_meanwhile = [event.text for event in events]
         saved_meanwhile = recorder.saved
     finally:
         run("fsfreeze", "-u", disk)
@@ -68,9 +68,9 @@ async def test_a_frozen_disk_costs_counted_frames_and_neither_telemetry_nor_time
         await recording
     await recorder.finish()
 
-    assert np.median(late_s) < 0.05  # a busy machine; whoever waits for the disk is late by 1 s in the median
+    assert np.median(late_s) < 0.05  # a busy machine; what waits for the disk is late by 1 s in the median
     assert max(late_s) < 1.0
-    assert any("the disk is too slow" in text for text in told_meanwhile)
+    assert any("the disk is too slow" in text for text in reported_meanwhile)
     published = (50 + FROZEN_TICKS + 50) // 5
     assert saved_meanwhile.frames == 10
     assert saved.frames + saved.frames_lost == published

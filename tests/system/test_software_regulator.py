@@ -56,11 +56,11 @@ async def test_it_finds_its_law_about_a_set_point_and_goes_on_without_a_bump(tmp
         await tuning
         await stand.wait(900)
         assert stand.trips() == []
-    (told,) = [event for event in stand.events if event.kind == "autotuned"]
-    law = Law.model_validate(told.data["law"])
+    (reported,) = [event for event in stand.events if event.kind == "autotuned"]
+    law = Law.model_validate(reported.data["law"])
     assert law.gain_percent_per_K == pytest.approx(10.4, rel=0.2)
     assert law.integral_s == pytest.approx(95, rel=0.2)
-    assert Law(**yaml.safe_load(told.text.partition("file: ")[2])["law"]) == law
+    assert Law(**yaml.safe_load(reported.text.partition("file: ")[2])["law"]) == law
     after = [abs(degC - 40) for time_s, degC in stand.series["regulator.pv"] if time_s > stand.time_s - 900]
     assert max(after) < 1.0
 
@@ -148,7 +148,7 @@ async def test_heat_that_it_does_not_see_is_found_by_the_guard(
         assert hottest_degC < config.guard.max_air_degC + 3
 
 
-async def test_a_heat_relay_that_somebody_else_holds_is_switched_off_and_told(tmp_path: Path):
+async def test_a_heat_relay_that_somebody_else_holds_is_switched_off_and_reported(tmp_path: Path):
     async with virtual_stand(bare_config("software-regulator", tmp_path)) as stand:
         await stand.hold(26, 1800)
 

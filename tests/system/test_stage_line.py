@@ -107,7 +107,7 @@ async def test_a_noisy_line_changes_nothing_but_the_time_it_takes(bench: Bench) 
     assert sum(bench.faults.injected.values()) > 5
 
 
-async def test_a_silent_controller_is_told_in_bounded_time_and_answers_again_by_itself(bench: Bench) -> None:
+async def test_a_silent_controller_is_reported_in_bounded_time_and_answers_again_by_itself(bench: Bench) -> None:
     axis = await bench.ready()
     bench.faults.silent = True
     begun_s = time.monotonic()
@@ -132,7 +132,7 @@ async def test_a_port_unplugged_and_plugged_in_again_is_read_again_its_identity_
     assert bench.tap.requests == ["gser", "geti", "gfwv", "geng", "gmov", "gpwr", "gets"]
 
 
-async def test_what_somebody_has_set_otherwise_meanwhile_is_told_when_it_is_back(bench: Bench) -> None:
+async def test_what_somebody_has_set_otherwise_meanwhile_is_reported_when_it_is_back(bench: Bench) -> None:
     axis = await bench.ready()
     assert [each.reason for each in await axis.read()] == ["", "", ""]
     bench.unplug()
@@ -373,7 +373,7 @@ async def test_a_trip_while_homed_is_answered_lets_no_move_of_the_plan_begin(ben
         await stand.table.move_to("linear", 5.0)
     await trip.made_safe[0]
     assert bench.tap.count("move") == before
-    with pytest.raises(Superseded):  # whoever does not ask the stand
+    with pytest.raises(Superseded):  # a program that does not ask the stand
         await axis.move_to(5.0)
     stand.gate.clear(INTERLOCK)
     move = asyncio.create_task(stand.table.move_to("linear", 25.0))

@@ -151,7 +151,7 @@ async def test_after_a_power_cycle_it_refuses_until_it_is_homed(bench: Bench) ->
 
 
 @each_wire
-async def test_another_controller_is_refused_and_told_by_its_number(bench: Bench) -> None:
+async def test_another_controller_is_refused_and_reported_by_its_number(bench: Bench) -> None:
     other = bench.another("rotary", 4102)
     for verb in (other.open, other.read, other.home, other.make_safe):
         with pytest.raises(Refused, match=r"^rotary: controller 4101 answers at .*, expected 4102$"):

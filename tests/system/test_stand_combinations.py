@@ -279,8 +279,8 @@ async def test_each_combination_runs_and_records_what_it_lacks(combination: Comb
     session = Session.open(await run_virtual(order, tmp_path / "out", 1, lambda _: None))
     assert session.run == "complete"
     assert len(session.frame_metas) == len(data["cameras"])
-    told = [event.text.partition(":")[0] for event in session.events() if event.kind == "absent"]
-    assert told == [sentence.partition(":")[0] for sentence in absences(order.config)]
+    reported = [event.text.partition(":")[0] for event in session.events() if event.kind == "absent"]
+    assert reported == [sentence.partition(":")[0] for sentence in absences(order.config)]
     air_degC = session.readings("thermometers.air")[1]
     assert len(air_degC) > 10
     assert all(len(session.readings(f"thermometers.{name}")[1]) == len(air_degC) for name in order.config.sensors)

@@ -78,8 +78,8 @@ async def test_a_window_a_camera_and_no_cold_is_a_stand(tmp_path: Path, build: C
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, lambda _: None))
     assert len(session.frame_metas) == 2
     assert [frame.image.mean() > 40 for frame in session.frames()] == [True, True]  # seen through the window
-    told = [event.data["what"] for event in session.events() if event.kind == "absent"]
-    assert told == ["flap", "stages", "compressor", "thermometer in the laboratory"]
+    reported = [event.data["what"] for event in session.events() if event.kind == "absent"]
+    assert reported == ["flap", "stages", "compressor", "thermometer in the laboratory"]
     assert max(session.readings("regulator.pv")[1]) > 26
     assert not [channel for channel in session.channels() if channel.startswith("flap.")]
     with pytest.raises(ConfigError, match="this stand has no axis 'linear', only none"):

@@ -65,11 +65,11 @@ async def test_a_chamber_that_is_away_comes_back(tmp_path: Path, set_point: floa
     assert [event.text for event in seen if event.level == "error"] == []
 
 
-async def test_after_the_longest_time_it_is_told_that_it_is_not(tmp_path: Path):
+async def test_after_the_longest_time_it_is_reported_that_it_is_not(tmp_path: Path):
     _, seen = await night(tmp_path, 14.0, max_s=60)
-    (told,) = (event for event in seen if event.kind == "not_at_ambient")
-    assert told.level == "warning"
-    assert told.text.startswith("after 1 min the air is ")
+    (reported,) = (event for event in seen if event.kind == "not_at_ambient")
+    assert reported.level == "warning"
+    assert reported.text.startswith("after 1 min the air is ")
 
 
 @pytest.mark.parametrize(("set_point", "ending"), [(24.5, {}), (14.0, {"to_ambient": False})])

@@ -105,16 +105,16 @@ async def says(path: Path, text: str) -> None:
 async def test_a_disk_that_hangs_withdraws_the_heat_until_it_is_back_and_keeps_nobody_from_leaving(
     disk: Path, tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
-    """Somebody is told while it hangs; when it hangs again, the run is stopped."""
-    told, clock = tmp_path / "told", WallClock()
-    ordered = telling(order(SOAK, **FAST), told)
+    """Somebody is notified while it hangs; when it hangs again, the run is stopped."""
+    reported, clock = tmp_path / "reported", WallClock()
+    ordered = telling(order(SOAK, **FAST), reported)
     await asyncio.to_thread(simulator, ordered.config, False)
     async with heating(ordered, disk / "out") as (task, watcher):
         watcher.events.clear()
         with frozen(disk):
             await happens(watcher, "guard.not_recorded")
             await heater_is(ordered, 0)
-            await says(told, "is not on the disk yet")
+            await says(reported, "is not on the disk yet")
             assert [event.kind for event in watcher.events if event.kind == "guard_late"] == []
         await happens(watcher, "hold_ended")
         await happens(watcher, "restored")
