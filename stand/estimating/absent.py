@@ -26,7 +26,7 @@ def _absences(config: StandConfig) -> Iterator[str]:
     if config.cameras and all(not camera.has_temperature for camera in config.cameras.values()):
         yield "no camera measures its own temperature: drift is fitted to the air and its history"
     if "granite_inside" not in config.sensors:
-        yield "no thermometer in the granite inside: its drift is not separated from the camera's, and it guards nothing"
+        yield "no thermometer in the granite inside: its drift is not split from the camera's, and it guards nothing"
     if not config.witnesses:
         yield "no witness of the air: a regulator's probe and an air thermometer that are wrong alike are not found"
     if "laboratory" not in config.sensors:
