@@ -249,4 +249,4 @@ def test_the_command_prints_the_table_and_refuses_in_a_sentence(session: Path, t
     assert "captures at 24.0 to 52.0 degC" in done.stdout
     refused = CliRunner().invoke(cli.app, ["budget", str(session), "--geometry", str(tmp_path / "none.yaml")])
     assert refused.exit_code == 2
-    assert "none.yaml: cannot be read" in refused.stderr
+    assert "none.yaml: no such file" in refused.stderr

@@ -120,7 +120,7 @@ def test_another_file_is_refused_with_a_sentence(
 
 
 def test_no_file_and_no_json_are_refused_with_a_sentence(tmp_path: Path):
-    with pytest.raises(SessionError, match="cannot be read"):
+    with pytest.raises(SessionError, match="no such file"):
         load_validation(tmp_path / "none.json")
     (tmp_path / "page.html").write_text("<html>")
     with pytest.raises(SessionError, match="not a validation"):
