@@ -234,8 +234,8 @@ async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night
         rows = editor.get_by_role("listitem")
         await editor.get_by_role("button", name="Remove: step 33").click()
         await rows.nth(0).get_by_label("chamber °C").fill("75")
-        await editor.get_by_role("button", name="Double: step 34").click()
-        await editor.get_by_role("button", name="Replace them").click()
+        await editor.get_by_role("button", name="Duplicate: step 34").click()
+        await editor.get_by_role("button", name="Use these steps").click()
         await rows.nth(0).get_by_text("a set-point of 75 degC").wait_for()
         assert not night.edited
         assert await rows.nth(2).locator(".error").is_hidden()
@@ -246,10 +246,10 @@ async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night
         await editor.get_by_role("button", name="Later: step 34").click()
         await editor.get_by_label("Kind of step to add").select_option("Prompt")
         await editor.get_by_role("button", name="Add this step").click()
-        await editor.get_by_role("button", name="Replace them").click()
+        await editor.get_by_role("button", name="Use these steps").click()
         await rows.nth(4).get_by_text("text: ").wait_for()
         await rows.nth(4).get_by_label("text").fill("Look at the lens")
-        await editor.get_by_role("button", name="Replace them").click()
+        await editor.get_by_role("button", name="Use these steps").click()
         await until(lambda: night.edited)
         await editor.wait_for(state="detached")
         assert night.orders[-1][2] == {"from_index": 32, "steps": 5}

@@ -43,7 +43,7 @@ export function duration(s) {
   const total = Math.max(0, Math.round(s));
   const hours = Math.floor(total / 3600), minutes = Math.floor((total % 3600) / 60);
   if (hours) return `${hours} h ${String(minutes).padStart(2, "0")} min`;
-  if (minutes) return total < 600 ? `${minutes} min ${String(total % 60).padStart(2, "0")} s` : `${minutes} min`;
+  if (minutes) return total < 600 && total % 60 ? `${minutes} min ${String(total % 60).padStart(2, "0")} s` : `${minutes} min`;
   return `${total} s`;
 }
 

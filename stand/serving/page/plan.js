@@ -165,5 +165,5 @@ function progress_text(step) {
   return step.earned_s > 0 ? ` – ${duration(step.earned_s)} of ${duration(step.duration_s)} earned` : "";
 }
 
-// How far the end may be off, as the stand tells it; "" before there is anything to go by.
+// How far the end may be off, as the stand says; "" before there is anything to go by.
 export const uncertainty = (run) => (run.end_within_s ? ` ± ${duration(run.end_within_s)}` : "");

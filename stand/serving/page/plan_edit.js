@@ -1,4 +1,4 @@
-// The steps to come as rows that are changed, moved, doubled, removed and added. The stand checks all of them after each
+// The steps to come as rows that are changed, moved, duplicated, removed and added. The stand checks all of them after each
 // change, and what is wrong stands in the row that it is about; nothing is replaced before nothing is wrong.
 import { command, get, send, tell } from "./api.js";
 import { duration, fill, h, words } from "./dom.js";
@@ -26,7 +26,7 @@ export class PlanEdit {
       this.kept.length ? h("p", { class: "quiet" }, `${this.kept.length} more steps behind these stay as they are.`) : null,
       h("div", { class: "row" }, this.kind, h("button", { type: "button", onclick: () => this.add() }, "Add this step at the end")),
       this.whole,
-      h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: () => this.replace() }, "Replace them"), h("button", { type: "button", onclick: () => this.close() }, "Leave them"))));
+      h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: () => this.replace() }, "Use these steps"), h("button", { type: "button", onclick: () => this.close() }, "Keep the plan"))));
     this.show();
     this.head.focus();
     this.check();
@@ -41,7 +41,7 @@ export class PlanEdit {
     row.was_degC = row.degC?.value;
     row.fault = h("p", { class: "answer error", hidden: true });
     row.note = h("p", { class: "level-warning", hidden: true });
-    row.acts = [button("▲", (each) => this.move(each, -1)), button("▼", (each) => this.move(each, 1)), button("Double", (each) => this.double(each)), button("Remove", (each) => this.remove(each))];
+    row.acts = [button("▲", (each) => this.move(each, -1)), button("▼", (each) => this.move(each, 1)), button("Duplicate", (each) => this.duplicate(each)), button("Remove", (each) => this.remove(each))];
     row.element = h("li", {}, row.number, h("div", { class: "what" }, row.words, h("div", { class: "values" }, row.fields.map((each) => each.row)), row.fault, row.note), h("span", { class: "acts" }, row.acts));
     return row;
   }
@@ -52,7 +52,7 @@ export class PlanEdit {
     this.rows.forEach((row, index) => {
       const number = this.from_index + index + 1;
       row.number.textContent = String(number);
-      ["Earlier", "Later", "Double", "Remove"].forEach((name, at) => row.acts[at].setAttribute("aria-label", `${name}: step ${number}`));
+      ["Earlier", "Later", "Duplicate", "Remove"].forEach((name, at) => row.acts[at].setAttribute("aria-label", `${name}: step ${number}`));
       row.acts[0].disabled = index === 0;
       row.acts[1].disabled = index === this.rows.length - 1;
       if (this.list.children[index] !== row.element) this.list.insertBefore(row.element, this.list.children[index] ?? null);
@@ -73,7 +73,7 @@ export class PlanEdit {
     this.changed(row.acts[by < 0 ? 0 : 1].disabled ? row.acts[by < 0 ? 1 : 0] : row.acts[by < 0 ? 0 : 1]);
   }
 
-  double(row) {
+  duplicate(row) {
     let parameters;
     try { parameters = collect(row.fields); } catch (error) { return this.fault(row, error.message); }
     const twin = this.row(row.kind, parameters, "", row.words.textContent);
