@@ -31,7 +31,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.plan_check import PlanCheck
+from stand.serving.plan_faults import PlanCheck
 from stand.serving.seen import seen_state
 
 Result = TypeVar("Result")

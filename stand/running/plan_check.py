@@ -14,7 +14,7 @@ from stand.running.memory.fold import after, refusal
 from stand.running.memory.state import RunState
 from stand.running.order import plan_faults
 from stand.serving.desk import WrittenStep
-from stand.serving.plan_check import PlanCheck, StepFault
+from stand.serving.plan_faults import PlanCheck, StepFault
 
 
 def check_edit(state: RunState, from_index: int, steps: Sequence[WrittenStep], config: StandConfig) -> PlanCheck:

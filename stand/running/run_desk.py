@@ -46,7 +46,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.plan_check import PlanCheck
+from stand.serving.plan_faults import PlanCheck
 from stand.serving.seen import seen_state
 
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from foundation.errors import StandError
 from foundation.readings import Cause, Quality
 from recording.reading.notes import LONGEST_NOTE
-from stand.serving.plan_check import PlanCheck
+from stand.serving.plan_faults import PlanCheck
 
 # Verbs of a command's event, in the words of the interface.
 Verb = Literal[

@@ -41,7 +41,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.plan_check import PlanCheck
+from stand.serving.plan_faults import PlanCheck
 
 STAND = "a stand"
 KNOWN_FAULTS = (

@@ -40,7 +40,7 @@ from stand.serving.desk import (
     WrittenStep,
 )
 from stand.serving.page_room import PageRoom
-from stand.serving.plan_check import PlanCheck
+from stand.serving.plan_faults import PlanCheck
 from stand.serving.viewing import Viewing
 from tests.stand.a_desk import ADesk, served
 

@@ -25,7 +25,7 @@ from foundation.readings import Frame
 from foundation.tasks import failure_text
 from stand.serving.command_event import COMMAND
 from stand.serving.desk import Desk, Done, PlanStep, StandState, Who, WrittenStep
-from stand.serving.plan_check import PlanCheck
+from stand.serving.plan_faults import PlanCheck
 
 _REFRESH_S = 0.5
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published

@@ -21,7 +21,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.plan_check import PlanCheck
+from stand.serving.plan_faults import PlanCheck
 
 _Id = Annotated[int, Path(ge=1, le=1 << 53)]
 _Name = Annotated[str, Path(max_length=255)]
