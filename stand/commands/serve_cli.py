@@ -29,6 +29,7 @@ from stand.daemon.serve import serve as serve_stand
 from stand.serving.api.bridge import Bridge
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve as serve_clients
+from stand.serving.api.server import try_doors
 from stand.serving.secop.door import door_at
 from stand.serving.viewing import Viewing
 from stand.watching.aside import aside
@@ -70,6 +71,7 @@ def serve(
         others = () if secop_port is None else (door_at(secop_port),)
         interface = Interface(directory, host, port, tokens, hosts, others)
         interface.check()
+        try_doors(interface)
 
         @asynccontextmanager
         async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:

@@ -2,12 +2,17 @@
 
 import json
 import math
+import socket
+from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.output import Output, outputting
+from stand.commands import serve_cli
+from stand.commands.command_table import app
 from stand.commands.serve_cli import _events_shown
 
 LOST = Event(7, "warning", "device_lost", "linear does not answer", {"device": "linear", "lost_s": math.nan})
@@ -37,3 +42,14 @@ def test_programs_get_events_one_a_line(capsys: pytest.CaptureFixture[str]):
         "text": "linear does not answer",
         "data": {"device": "linear", "lost_s": None},
     }
+
+
+def test_a_port_in_use_is_said_before_any_device_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    opened: list[object] = []
+    monkeypatch.setattr(serve_cli, "serve_stand", lambda *args, **_: opened.append(args))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        refused = CliRunner().invoke(app, ["serve", "simulated", "--out", str(tmp_path), "--port", str(port)])
+    assert refused.exit_code == 2
+    assert f"--port {port}: cannot listen at 127.0.0.1 (Address already in use)" in refused.stderr
+    assert not opened

@@ -51,9 +51,7 @@ async def serve(
     presence = Presence(Entry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
     doors = {"socket": presence.appear()}
     try:
-        if interface.port is not None:
-            doors["tcp"] = _tcp("--port", interface.host, interface.port)
-        doors.update({each.option: _tcp(each.option, each.host, each.port) for each in interface.doors})
+        doors.update(_tcp_doors(interface))
         bridge = Bridge(desk, hub, clock)
     except BaseException:
         for door in doors.values():
@@ -90,6 +88,27 @@ def preload() -> None:
             importlib.import_module(f"stand.serving.api.{name}")
 
     threading.Thread(target=load, name="interface-imports", daemon=True).start()
+
+
+def try_doors(interface: Interface) -> None:
+    """ConfigError when nobody can listen at one of its ports: a port in use is said before a device is opened."""
+    for door in _tcp_doors(interface).values():
+        door.close()
+
+
+def _tcp_doors(interface: Interface) -> dict[str, socket.socket]:
+    """Listening at each of its ports, or at none of them."""
+    doors: dict[str, socket.socket] = {}
+    try:
+        if interface.port is not None:
+            doors["tcp"] = _tcp("--port", interface.host, interface.port)
+        for each in interface.doors:
+            doors[each.option] = _tcp(each.option, each.host, each.port)
+    except ConfigError:
+        for door in doors.values():
+            door.close()
+        raise
+    return doors
 
 
 def _tcp(option: str, host: str, port: int) -> socket.socket:
