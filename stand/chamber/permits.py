@@ -29,6 +29,7 @@ _EARLY_S = 1.0  # a relay that is off so shortly before its time may just have d
 # The self-test of the dead-man, in units of self_test_s / 3: armed, armed again, must be on, must be off.
 _AGAIN, _STILL_ON, _OFF, _PULSE = 2.0, 4.0, 6.5, 3.0
 _LOOK = 0.05  # between looks of a test that is timed
+_TEST_TRIES = 3  # of that test, when this computer is held up in it
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,25 +148,13 @@ class Permits:
         The regulator must be stopped, with an output of 0. Event "dead_man_tested" with what was found; is_timed: the
         board is looked at all the time, and `held_s` is how long after the second arming its relay was seen to drop.
         """
-        unit_s, begin_ns = self._limits.self_test_s / _PULSE, self._clock.now_ns()
-
-        async def at(units: float) -> bool:
-            await self._clock.sleep_until(begin_ns + seconds_ns(units * unit_s))
-            return (await self._coils())[HEATER]
-
-        try:
-            await self._relays.hold_on(HEATER, self._limits.self_test_s)
-            await at(_AGAIN)
-            again_ns = self._clock.now_ns()
-            await self._relays.hold_on(HEATER, self._limits.self_test_s)
-            on = await at(_STILL_ON)
-            units, held_s = _STILL_ON, None
-            while is_timed and held_s is None and (units := units + _LOOK) < _OFF:
-                if not await at(units):
-                    held_s = round((self._clock.now_ns() - again_ns) / NS_PER_S, 2)
-            off = not await at(_OFF)
-        finally:
-            await self._relays.switch(HEATER, on=False)
+        for _ in range(_TEST_TRIES):
+            if (found := await self._timer_found(is_timed)) is not None:
+                break
+        else:
+            text = "its timer could not be tested: this computer was held up in each of the tests; see what loads it"
+            raise DeviceFault(self.name, text)
+        on, off, held_s = found
         data: dict[str, object] = {"rearmed": on, "dropped": off, "pulse_s": self._limits.self_test_s}
         if is_timed:
             data["held_s"] = held_s
@@ -177,6 +166,34 @@ class Permits:
         text = f"this board is not suited: a timed-on of the heater's relay {fault}; heat could not be guarded with it"
         self._hub.publish(Event(self._clock.now_ns(), "error", "dead_man_tested", f"{self.name}: {text}", data))
         raise DeviceFault(self.name, text)
+
+    async def _timer_found(self, is_timed: bool) -> tuple[bool, bool, float | None] | None:
+        """Whether the relay was held by the second arming, whether it then dropped, and after how many s; None when
+        the commands came so late that this says nothing: a second arming after the first one's time arms any board."""
+        pulse_s, sent_ns = self._limits.self_test_s, self._clock.now_ns()
+        unit_s, held_s = pulse_s / _PULSE, None
+        try:
+            await self._relays.hold_on(HEATER, pulse_s)
+            begin_ns = self._clock.now_ns()  # it may count from here
+
+            async def at(units: float) -> bool:
+                await self._clock.sleep_until(begin_ns + seconds_ns(units * unit_s))
+                return (await self._coils())[HEATER]
+
+            await at(_AGAIN)
+            again_ns = self._clock.now_ns()
+            await self._relays.hold_on(HEATER, pulse_s)
+            is_late = self._clock.now_ns() >= sent_ns + seconds_ns(pulse_s)
+            on = await at(_STILL_ON)
+            is_late = is_late or (not on and self._clock.now_ns() >= again_ns + seconds_ns(pulse_s))
+            units = _STILL_ON
+            while is_timed and held_s is None and (units := units + _LOOK) < _OFF:
+                if not await at(units):
+                    held_s = round((self._clock.now_ns() - again_ns) / NS_PER_S, 2)
+            off = not await at(_OFF)
+        finally:
+            await self._relays.switch(HEATER, on=False)
+        return None if is_late else (on, off, held_s)
 
     def _compare(self, coils: dict[str, bool]) -> None:
         """What has dropped though its time was not over."""

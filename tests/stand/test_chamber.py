@@ -6,6 +6,7 @@ import pytest
 
 from foundation.clock import seconds_ns
 from foundation.errors import ConfigError, DeviceFault, GarbledReply, Occupied, StandTripped, Unreachable
+from foundation.readings import Reading
 from foundation.tasks import cancelled
 from stand.chamber.permits import HEATER
 from stand.fault import Fault
@@ -150,3 +151,28 @@ async def test_permits_that_are_not_renewed_are_reported_once_for_each_reason():
         await clock.sleep_until(clock.now_ns() + seconds_ns(10 * keeper.renew_s))
         await cancelled([keeping])
         assert here.kinds.count("permit_not_renewed") == 2
+
+
+@pytest.mark.parametrize("late_s", [(0.0, 1.5), (1.5, 0.0)])
+async def test_a_board_that_does_not_rearm_is_refused_also_when_commands_reach_it_late(late_s: tuple[float, float]):
+    """After the first one's time a second timed-on is a first one, which any board takes."""
+    async with rooms() as here:
+        until_ns, delays_s = 0, iter(late_s)
+
+        async def hold_on(channel: str, duration_s: float) -> None:
+            nonlocal until_ns
+            await here.clock.sleep_until(here.clock.now_ns() + seconds_ns(next(delays_s, 0.0)))
+            if here.clock.now_ns() >= until_ns:
+                until_ns = here.clock.now_ns() + seconds_ns(duration_s)
+
+        async def switch(channel: str, on: bool) -> None:
+            nonlocal until_ns
+            until_ns = 0
+
+        async def read() -> tuple[Reading, ...]:
+            now_ns = here.clock.now_ns()
+            return (Reading(f"relays.{HEATER}", float(now_ns < until_ns), "1", now_ns),)
+
+        here.relays.hold_on, here.relays.switch, here.relays.read = hold_on, switch, read
+        with pytest.raises(DeviceFault, match="does not start its time again"):
+            await here.stand.chamber.test_dead_man()
