@@ -6,14 +6,13 @@ on at its last set-point. So the limits of its own controller are part of what i
 
 from __future__ import annotations
 
-import asyncio
 import importlib
-from collections.abc import AsyncGenerator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from typing import Protocol, cast
 
 from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
 from drivers.devices.chambers.chamber_settings import ChamberUnitSettings
+from drivers.devices.exclusive import Exclusive
 from drivers.settings import Identity, same_device
 from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
@@ -51,8 +50,7 @@ class ClimateChamber:
         self._language = module.Language(name, settings)
         self.dead_man = self._language.dead_man
         self._lane: Lane | None = None
-        self._lock = asyncio.Lock()
-        self._is_checked = False
+        self._exclusive = Exclusive()
         self._sp_degC: float | None = None
         self._from_degC: float | None = None  # where a ramp to it began
         self._is_run = False
@@ -62,7 +60,7 @@ class ClimateChamber:
         """Identity and limits; nothing is commanded. DeviceFault when it is another unit, or may be set too far."""
         if self._lane is None:
             self._lane = Lane(self.name, self._clock)
-        async with self._exclusive():
+        async with self._exclusive:
             await self._call(self._check)
 
     async def close(self) -> None:
@@ -74,7 +72,7 @@ class ClimateChamber:
 
     async def read(self) -> tuple[Reading, ...]:
         """pv, sp, running, fault; the reason of `fault` has its alarms and what was done at the panel."""
-        async with self._exclusive():
+        async with self._exclusive:
             state = await self._call(self._state)
             if self._is_run and state.running and self._clock.now_ns() >= self._renew_ns:
                 await self._call(self._language.renew)
@@ -87,35 +85,25 @@ class ClimateChamber:
         low_degC, high_degC = self._allowed_degC
         if not low_degC <= degC <= high_degC:
             raise Refused(self.name, f"{degC:g} degC is outside {low_degC:g}..{high_degC:g} degC; nothing was sent")
-        async with self._exclusive():
+        async with self._exclusive:
             await self._call(self._set, degC)
             self._sp_degC = degC
 
     async def run(self) -> None:
         """Switch humidity off, start, confirmed. DeviceFault: an alarm stands, which only an operator may reset."""
-        async with self._exclusive():
+        async with self._exclusive:
             await self._call(self._start)
             self._is_run, self._renew_ns = True, self._clock.now_ns() + seconds_ns(_RENEW_S)
 
     async def stop(self) -> None:
         """Stop, confirmed."""
-        async with self._exclusive():
+        async with self._exclusive:
             self._is_run = False
             await self._call(self._switch, False)
 
     async def make_safe(self) -> None:
         """Stopped, confirmed; DeviceFault when it is not."""
         await self.stop()
-
-    @asynccontextmanager
-    async def _exclusive(self) -> AsyncGenerator[None]:
-        """One sequence of requests at a time; after a loss somebody else may answer."""
-        async with self._lock:
-            try:
-                yield
-            except Unreachable:
-                self._is_checked = False
-                raise
 
     async def _call(self, function: Callable[..., Result], *args: object) -> Result:
         if self._lane is None:
@@ -132,7 +120,7 @@ class ClimateChamber:
         found = Identity("", answer or f"climate chamber that speaks {protocol}", "", "", by_map=not answer)
         self.identity = same_device(self.name, found, self.identity)
         self._check_limits()
-        self._is_checked = True
+        self._exclusive.is_known = True
 
     def _check_limits(self) -> None:
         found, low, high = self._language.limits_degC(), *self._allowed_degC
@@ -153,7 +141,7 @@ class ClimateChamber:
 
     def _ready(self) -> ChamberState:
         """Its state, after it was made sure who answers."""
-        if not (self._is_checked and self._language.client.connected):
+        if not (self._exclusive.is_known and self._language.client.connected):
             self._check()
         return self._language.state()
 
@@ -202,7 +190,7 @@ class ClimateChamber:
         self._switch(True)
 
     def _switch(self, on: bool) -> None:
-        if not self._is_checked and on:
+        if not self._exclusive.is_known and on:
             self._check()
         if not on and self._has_stopped():
             return

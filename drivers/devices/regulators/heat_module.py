@@ -6,14 +6,13 @@ it heats nothing but the law writes to it or reads it: what goes on asking must 
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncGenerator
-from contextlib import asynccontextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from typing import NoReturn, Self
 
 from pydantic import Field, model_validator
 
+from drivers.devices.exclusive import Exclusive
 from drivers.devices.relays import COIL_OFF, COIL_ON
 from drivers.settings import Identity, OnBus
 from drivers.wires.modbus_unit import ModbusUnit
@@ -72,8 +71,7 @@ class HeatModule:
             )
         self._present = present if (present := f"present_{place}") in points else self._output
         self._type_code = type_code if (type_code := f"type_code_{place}") in points else None
-        self._lock = asyncio.Lock()  # a write and what is read back stay together
-        self._is_known = False  # whether it was asked who it is since it was last lost
+        self._exclusive = Exclusive()
         self._is_safe = False  # whether its safe value has been read back
         self._armed_ns: int | None = None  # when its watchdog was last refreshed; None: it is off
         self._checked_ns = 0  # when its watchdog and safe value were last read
@@ -92,7 +90,7 @@ class HeatModule:
     async def open(self) -> None:
         """Check identity, range, and that what it gives without us is safe, which is set where it differs; DeviceFault
         when it stays otherwise. The output is not changed."""
-        async with self._exclusive():
+        async with self._exclusive:
             await self._prepare()
 
     async def close(self) -> None:
@@ -102,7 +100,7 @@ class HeatModule:
         """output (mA, what it gives), tripped; while it heats those of the law's last exchange, STALE when the law's
         next one has failed, or is overdue. DeviceError, and the output is at zero, when it gives heat though nothing
         does."""
-        async with self._exclusive():
+        async with self._exclusive:
             if self._armed_ns is not None and self._last:
                 return self._exchanged()
             await self._make_sure()
@@ -124,7 +122,7 @@ class HeatModule:
     async def arm(self) -> None:
         """Before control begins: safe values as configured, output at zero, watchdog on and not tripped, all read back.
         A trip is cleared: the program that starts control has seen it."""
-        async with self._exclusive():
+        async with self._exclusive:
             self._armed_ns, self._left_mA = None, None
             await self._prepare()
             await self._unit.write(_TIME, self._settings.watchdog_s)
@@ -141,7 +139,7 @@ class HeatModule:
         """The heat from now on; at_once has no meaning here. Also refreshes the watchdog. DeviceFault when it does not
         give what it was left at, which ends with zero; or when it has tripped, somebody has changed what it does
         without us, or it is `uncontrolled`, which last until it is armed again."""
-        async with self._exclusive():
+        async with self._exclusive:
             if self._armed_ns is None:
                 raise DeviceFault(self.name, "gives no heat: it was not armed")
             if self._trip:
@@ -161,7 +159,7 @@ class HeatModule:
     async def off(self) -> None:
         """No heat, confirmed; DeviceError. Its watchdog is off from then, unless it cannot be reached for that: then it
         trips, which is as safe."""
-        async with self._exclusive():
+        async with self._exclusive:
             await self._zero()
             self.uncontrolled = ""
             with suppress(DeviceError):
@@ -189,21 +187,11 @@ class HeatModule:
         finally:
             await self.off()
 
-    @asynccontextmanager
-    async def _exclusive(self) -> AsyncGenerator[None]:
-        """A write and what is read back stay together; after a loss another module may stand there."""
-        async with self._lock:
-            try:
-                yield
-            except Unreachable:
-                self._is_known = False
-                raise
-
     async def _make_sure(self) -> None:
         """That it is the module that answered before, or it gets no heat; off is never withheld."""
-        if not self._is_known:
+        if not self._exclusive.is_known:
             await self._unit.probe()
-            self._is_known = True
+            self._exclusive.is_known = True
 
     async def _pause(self, share: float) -> None:
         await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(share * self._settings.watchdog_s))
@@ -211,7 +199,7 @@ class HeatModule:
     async def _prepare(self) -> None:
         self._is_safe = False
         await self._unit.probe()
-        self._is_known = True
+        self._exclusive.is_known = True
         if self._type_code is not None:
             sample = (await self._unit.snapshot([self._type_code])).samples[self._type_code]
             if sample.reason:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncGenerator
-from contextlib import asynccontextmanager
-
+from drivers.devices.exclusive import Exclusive
 from drivers.settings import Identity
 from drivers.wires.bus import Bus
 from drivers.wires.modbus_unit import ModbusUnit, Sample, Snapshot, is_confirmed
 from drivers.wires.registers import RegisterMap
 from foundation.clock import Clock, seconds_ns
-from foundation.errors import ConfigError, Occupied, Refused, Unreachable
+from foundation.errors import ConfigError, Occupied, Refused
 from foundation.readings import Reading, bad_reading
 
 PROBE_PERIOD_S = 30.0
@@ -44,9 +41,8 @@ class Regulator:
         self._unit = ModbusUnit(name, bus, register_map)
         self._map = register_map
         self._clock = clock
-        self._lock = asyncio.Lock()
+        self._exclusive = Exclusive()
         self._sp_degC: float | None = None  # the set point as the unit took it, to be sent again
-        self._start_up_due = True
         self._probe_ns = 0
         confirming = {register_map.commands[name].confirm.point for name in register_map.startup}
         self._status = [
@@ -60,7 +56,7 @@ class Regulator:
 
     async def open(self) -> None:
         """Probe identity and scaling, enable writing, RAM mode, each confirmed; neither runs nor stops control."""
-        async with self._exclusive():
+        async with self._exclusive:
             await self._start_up()
 
     async def close(self) -> None:
@@ -71,7 +67,7 @@ class Regulator:
 
         The reason of `fault` names the bits that are set, and says when somebody changed the set point at the unit.
         """
-        async with self._exclusive():
+        async with self._exclusive:
             await self._ensure_started()
             if self._clock.now_ns() >= self._probe_ns:
                 await self._probe()
@@ -90,7 +86,7 @@ class Regulator:
         Refused: outside the map's limits (nothing is sent), RAM mode not confirmed, not taken over. Occupied:
         autotuning, started at the unit, is active.
         """
-        async with self._exclusive():
+        async with self._exclusive:
             await self._ensure_started()
             status = await self._unit.snapshot(self._status)
             if not self._ready(status):
@@ -101,7 +97,7 @@ class Regulator:
 
     async def run(self) -> None:
         """Start control, confirmed."""
-        async with self._exclusive():
+        async with self._exclusive:
             await self._ensure_started()
             await self._unit.command("run")
 
@@ -115,34 +111,24 @@ class Regulator:
 
     async def _force(self, commands: tuple[str, ...]) -> None:
         """Send commands at once, also to a unit that has been power-cycled and refuses writing at first."""
-        async with self._exclusive():
+        async with self._exclusive:
             try:
                 await self._commands(commands)
             except Refused:
                 await self._commands(self._map.startup)
                 await self._commands(commands)
 
-    @asynccontextmanager
-    async def _exclusive(self) -> AsyncGenerator[None]:
-        """One sequence of requests at a time: a write and its read-back stay together."""
-        async with self._lock:
-            try:
-                yield
-            except Unreachable:
-                self._start_up_due = True  # it may come back power-cycled
-                raise
-
     async def _ensure_started(self) -> None:
-        if self._start_up_due:
+        if not self._exclusive.is_known:
             await self._start_up()
 
     async def _start_up(self) -> None:
-        self._start_up_due = True
+        self._exclusive.is_known = False
         await self._probe()
         await self._commands(self._map.startup)
         if self._sp_degC is not None:
             await self._write_set_point(self._sp_degC)
-        self._start_up_due = False
+        self._exclusive.is_known = True
         self.start_ups += 1
 
     async def _write_set_point(self, degC: float) -> float:
