@@ -44,6 +44,7 @@ _OF_KIND = {
     "compressor_not_kept": _SEE_DISK,
     "cool_down_unsure": "see by the first readings whether the camera was cold when it was switched on; " + _CAREFUL,
     "daemon_not_kept": _SEE_DISK,
+    "dead_man_late": "it is tested again by itself; see what loads this computer when that is so at each start",
     "dead_man_tested": "take a board whose timed-on each command restarts (docs/drivers.md); `stand check --moves`",
     "device_lost": _CONNECTED,
     "device_slow": "look at its line: speed, cable, how many units are on it; `stand check` times each device",

@@ -176,3 +176,4 @@ async def test_a_board_that_does_not_rearm_is_refused_also_when_commands_reach_i
         here.relays.hold_on, here.relays.switch, here.relays.read = hold_on, switch, read
         with pytest.raises(DeviceFault, match="does not start its time again"):
             await here.stand.chamber.test_dead_man()
+        assert here.kinds.count("dead_man_late") == 1
