@@ -19,7 +19,7 @@ from foundation.output import say, show
 from foundation.usage import one_line
 from stand.commands.reached import ConfigOption, DirectoryOption, TokenOption, UrlOption, on_stand, reached
 from stand.commands.submitted import submit_recipe
-from stand.serving.client import API, Answer, Server
+from stand.serving.client import API, Answer, Server, running_sessions
 from stand.serving.desk import DeviceState, StandState
 
 app = App()
@@ -103,7 +103,11 @@ def _without_daemon(config: str, name: str, verb: str, arguments: dict[str, obje
     from stand.daemon.hands_on import by_hand, known_devices
 
     stand = load_config(packaged("", config))
+    others = ", ".join(map(str, running_sessions()))
+    elsewhere = f"; one runs at {others}: `--dir` names it, if it has this stand" if others else ""
+    note = f"no daemon runs in {stand.recording.directory}{elsewhere}"
     if verb:
+        say(f"{note}; {name} is opened for this command")
         values = cast("dict[str, JsonValue]", arguments)
         done = asyncio.run(by_hand(stand, name, verb, values, out, say))
         show(done.data, map(one_line, done.lines))
@@ -111,8 +115,8 @@ def _without_daemon(config: str, name: str, verb: str, arguments: dict[str, obje
     devices = [each for each in known_devices(stand) if name in ("", each.name)]
     if not devices:
         raise ConfigError(f"there is no device {name}; `stand device` lists them")
-    note = "no daemon has this stand: a device is opened for each command, and left safe at its end"
-    show([each.model_dump(mode="json") for each in devices], [note, *_device_lines(devices)])
+    note = f"{note}: a device is opened for each command, and left safe at its end"
+    show([each.model_dump(mode="json") for each in devices], [one_line(note), *_device_lines(devices)])
 
 
 def _show_devices(server: Server, name: str) -> None:
