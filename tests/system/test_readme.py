@@ -82,6 +82,22 @@ def test_a_command_in_the_text_exists(command: str):
     assert called([*words, "--help"]).exit_code == 0
 
 
+def test_the_commands_in_the_pages_of_docs_exist_with_their_options():
+    pages = [page.read_text(encoding="utf-8") for page in ROOT.glob("docs/*.md") if "decisions" not in page.name]
+    inline = {found for page in pages for found in re.findall(r"`((?:stand|compensate) [a-z][^`]*)`", page)}
+    blocks = {
+        found for page in pages for found in re.findall(r"(?m)^ {4}(?:\.venv/bin/)?((?:stand|compensate) .*)", page)
+    }
+    typed = {
+        re.sub(r"  #.*|[\[\]]| --[a-z-]+$", "", command) for command in inline | blocks
+    }  # a last option lacks its value
+    assert len(typed) > 60
+    wrong = {
+        command: result.output for command in typed if (result := called([*shlex.split(command), "--help"])).exit_code
+    }
+    assert not wrong
+
+
 @pytest.mark.parametrize("option", sorted(set(re.findall(r"`(--[a-z-]+)", README))))
 def test_an_option_in_the_text_exists(option: str):
     sources = [*ROOT.glob("stand/commands/*.py"), *ROOT.glob("compensation/commands/*.py")]
