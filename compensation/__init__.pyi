@@ -12,7 +12,7 @@ from compensation.drift.evaluation import evaluate as evaluate
 from compensation.drift.model_file import load_model as load_model
 from compensation.drift.model_file import save_model as save_model
 from compensation.drift.type_prior import fit_like as fit_like
-from compensation.finding.found import finder as finder
+from compensation.finding.finder import finder as finder
 from compensation.observations import Observations as Observations
 from compensation.observations import observe as observe
 from compensation.reporting.report import write_report as write_report

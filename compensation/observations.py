@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.finding.found import Finder
+from compensation.finding.finder import Finder
 from compensation.finding.piece import FoundMarkers, joined, pieces_of
 from compensation.history.thermal_history import History, recorded_history
 from compensation.one_camera import others_ns, serial_of, take

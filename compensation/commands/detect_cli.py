@@ -25,8 +25,8 @@ from foundation.output import say, show
 from foundation.progress import Report, late_progress
 from foundation.usage import one_line
 from markers.detection import Detection, DetectionError, Image, detect, nothing_found
+from markers.detections_table import CENTRES, DetectedImage, doubt, write_detections
 from markers.image_file import read_image
-from markers.table import CENTRES, DetectedImage, doubt, write_detections
 from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from compensation.finding.found import finder
+from compensation.finding.finder import finder
 from compensation.observations import Observations, observe
 from compensation.one_camera import take
 from foundation.errors import ConfigError

@@ -24,8 +24,8 @@ from foundation.output import say, show
 from foundation.progress import Report, progress
 from markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
 from markers.detection import DetectionError, Image, detect
+from markers.detections_table import doubt
 from markers.image_file import read_image
-from markers.table import doubt
 from markers.target import Target
 
 app = App()

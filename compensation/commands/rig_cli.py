@@ -25,8 +25,8 @@ from foundation.output import say, show
 from foundation.progress import Report, progress
 from markers.corner_board import BoardOfCorners
 from markers.detection import DetectionError
+from markers.detections_table import doubt
 from markers.image_file import read_image
-from markers.table import doubt
 from markers.target import Target
 
 app = App()

@@ -21,7 +21,7 @@ from compensation.drift.paper_model import PaperModel
 from compensation.reporting.report import analyse
 from foundation.errors import SessionError
 from foundation.progress import progress
-from markers.table import COLUMNS
+from markers.detections_table import COLUMNS
 
 from .conftest import DARK, SEQUENCE, TARGET_YAML, Recorded, photo
 

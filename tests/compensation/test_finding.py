@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from compensation.finding.cache import keep, kept
-from compensation.finding.found import Finder, finder
+from compensation.finding.finder import Finder, finder
 from compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
 from compensation.finding.workers import find_to_file, in_processes, in_turn, on_cluster
 from compensation.observations import session_target

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from foundation.errors import SessionError
 from markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image
+from markers.detections_table import COLUMNS, DetectedImage, flags_text, write_detections
 from markers.eccentricity import disc_centres
 from markers.image_file import read_image
-from markers.table import COLUMNS, DetectedImage, flags_text, write_detections
 from markers.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, photograph, render, true_centres_px
