@@ -4,7 +4,7 @@ Own messages are in package `thermostand`, one file each, made here at run time 
 schema its name is used. Every batch message has one double per quantity, its unit in the field's name, and a quality
 beside it; a quantity the device did not give is NaN and ABSENT, so that no viewer draws it as 0. `remarks` repeats
 in full each reading the fixed fields cannot carry: it has a reason, an instant of its own, or no field. Images are in
-recording/format/images.py.
+recording/format/images.py; batches are encoded where they are written, in recording/writing/telemetry.py.
 
 Field numbers follow the order of the tables here and of recording/format/kinds.py. They are the file format: append,
 never reorder.
@@ -97,7 +97,7 @@ def _batch_class(kind: Kind) -> type[Message]:
     return _message_class(kind.schema, fields, needs_reading=True)
 
 
-_Reading = _message_class(
+REMARK_CLASS = _message_class(
     "Reading",
     [
         _field("channel", 1, STRING),
@@ -142,51 +142,9 @@ CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "ala
 LOG_LEVEL = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 
-class BatchEncoder:
-    """The batches of one device as messages of its kind; the look-ups are done once."""
-
-    def __init__(self, device: str, kind: Kind) -> None:
-        self.topic = kind.topic
-        self._class = CLASSES[kind.topic]
-        self._blank: dict[str, object] = {"device": device, **{q.field: math.nan for q in kind.quantities}}
-        self._fields = {(f"{device}.{q.name}", q.unit): (q.field, f"{q.field}_quality") for q in kind.quantities}
-
-    def encode(self, batch: Batch) -> bytes:
-        """The batch as one message; nothing of a reading is lost, for any channel, unit or time."""
-        fields = self._blank.copy()
-        readings = batch.readings
-        time_ns = (readings[0].time_ns if readings else 0) or batch.time_ns  # 0 in the message is the log time
-        if time_ns != batch.time_ns:
-            fields["time_ns"] = time_ns
-        is_repeated = len({(reading.channel, reading.unit) for reading in readings}) < len(readings)
-        remarks: list[Message] = []
-        for reading in readings:
-            names = self._fields.get((reading.channel, reading.unit))
-            if names is not None:
-                fields[names[0]] = _canonical(reading.value)
-                fields[names[1]] = QUALITY_NUMBER[reading.quality]
-            if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
-                remarks.append(_remark(reading))
-        if remarks:
-            fields["remarks"] = remarks
-        return self._class(**fields).SerializeToString()
-
-
-def _canonical(value: float) -> float:
+def canonical(value: float) -> float:
     """One bit pattern for every NaN: equal readings are equal bytes."""
     return math.nan if value != value else value
-
-
-def _remark(reading: Reading) -> Message:
-    return _Reading(
-        channel=reading.channel,
-        value=_canonical(reading.value),
-        unit=reading.unit,
-        time_ns=reading.time_ns,
-        quality=QUALITY_NUMBER[reading.quality],
-        reason=reading.reason,
-        cause=reading.cause,
-    )
 
 
 def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Batch:
@@ -232,7 +190,7 @@ def encode_frame_meta(frame: Frame) -> bytes:
         camera_ticks=frame.camera_ticks,
         exposure_s=frame.exposure_s,
         gain_dB=frame.gain_dB,
-        camera_degC=_canonical(frame.camera_degC),
+        camera_degC=canonical(frame.camera_degC),
         dropped=frame.dropped,
     ).SerializeToString()
 

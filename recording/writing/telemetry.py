@@ -6,19 +6,22 @@ are encoded and committed by a lane's thread, off the loop.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from google.protobuf.message import Message
 
 from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import SessionError
 from foundation.items import Batch, Event, Item, Original, StepMark
-from foundation.readings import Frame, Quality
+from foundation.readings import Frame, Quality, Reading
 from recording.format import messages
 from recording.format.decoded_items import Description, UndescribedFrame
+from recording.format.kinds import KINDS, Kind
 from recording.format.layout import SEQUENCE_MASK, TELEMETRY
 from recording.writing.homes import Homes, Kept
 from recording.writing.notices import DroppedReadings, Notice, telemetry_notice
@@ -135,13 +138,11 @@ class TelemetryEncoder:
     """Items of the hub to records of the telemetry series; `devices` maps a device's name to its kind."""
 
     def __init__(self, devices: Mapping[str, str]) -> None:
-        unknown = sorted({kind for kind in devices.values() if kind not in messages.KINDS})
+        unknown = sorted({kind for kind in devices.values() if kind not in KINDS})
         if unknown:
-            raise ValueError(f"no device kind {', '.join(unknown)}; there are {', '.join(messages.KINDS)}")
+            raise ValueError(f"no device kind {', '.join(unknown)}; there are {', '.join(KINDS)}")
         self._devices = dict(devices)
-        self._encoders = {
-            name: messages.BatchEncoder(name, messages.KINDS[kind]) for name, kind in self._devices.items()
-        }
+        self._encoders = {name: BatchEncoder(name, KINDS[kind]) for name, kind in self._devices.items()}
         self._table: dict[str, float] = {}  # unit -> last position of the axis in that unit
 
     def check(self, item: Item) -> None:
@@ -183,6 +184,48 @@ class TelemetryEncoder:
         if "mm" in self._table and "deg" in self._table:
             pose = messages.encode_table_pose(batch.time_ns, self._table["mm"], self._table["deg"])
             yield Record(messages.TABLE_POSE, batch.time_ns, pose)
+
+
+class BatchEncoder:
+    """The batches of one device as messages of its kind; the look-ups are done once."""
+
+    def __init__(self, device: str, kind: Kind) -> None:
+        self.topic = kind.topic
+        self._class = messages.CLASSES[kind.topic]
+        self._blank: dict[str, object] = {"device": device, **{q.field: math.nan for q in kind.quantities}}
+        self._fields = {(f"{device}.{q.name}", q.unit): (q.field, f"{q.field}_quality") for q in kind.quantities}
+
+    def encode(self, batch: Batch) -> bytes:
+        """The batch as one message; nothing of a reading is lost, for any channel, unit or time."""
+        fields = self._blank.copy()
+        readings = batch.readings
+        time_ns = (readings[0].time_ns if readings else 0) or batch.time_ns  # 0 in the message is the log time
+        if time_ns != batch.time_ns:
+            fields["time_ns"] = time_ns
+        is_repeated = len({(reading.channel, reading.unit) for reading in readings}) < len(readings)
+        remarks: list[Message] = []
+        for reading in readings:
+            names = self._fields.get((reading.channel, reading.unit))
+            if names is not None:
+                fields[names[0]] = messages.canonical(reading.value)
+                fields[names[1]] = messages.QUALITY_NUMBER[reading.quality]
+            if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
+                remarks.append(_remark(reading))
+        if remarks:
+            fields["remarks"] = remarks
+        return self._class(**fields).SerializeToString()
+
+
+def _remark(reading: Reading) -> Message:
+    return messages.REMARK_CLASS(
+        channel=reading.channel,
+        value=messages.canonical(reading.value),
+        unit=reading.unit,
+        time_ns=reading.time_ns,
+        quality=messages.QUALITY_NUMBER[reading.quality],
+        reason=reading.reason,
+        cause=reading.cause,
+    )
 
 
 class TelemetryWriter:

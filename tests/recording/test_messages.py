@@ -12,6 +12,7 @@ from foundation.errors import SessionError
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Quality, Reading, bad_reading
 from recording.format import messages
+from recording.writing.telemetry import BatchEncoder
 
 TIME_NS = 1_767_290_400_123_456_789
 
@@ -32,7 +33,7 @@ def frame(image, **changes):
 
 
 def round_trip(kind, batch):
-    encoder = messages.BatchEncoder(batch.device, messages.KINDS[kind])
+    encoder = BatchEncoder(batch.device, messages.KINDS[kind])
     return messages.decode_batch(encoder.topic, encoder.encode(batch), batch.time_ns).readings
 
 
@@ -44,7 +45,7 @@ def same(left, right):
 
 def test_temperatures_have_the_fields_and_values_a_viewer_expects():
     readings = (Reading("pt.air", 23.98, "degC", TIME_NS), bad_reading("pt.artifact", "degC", TIME_NS, "sensor break"))
-    encoder = messages.BatchEncoder("pt", messages.KINDS["thermometers"])
+    encoder = BatchEncoder("pt", messages.KINDS["thermometers"])
     message = messages.CLASSES["/sensors/temperature"].FromString(encoder.encode(Batch("pt", TIME_NS, readings)))
     assert message.DESCRIPTOR.full_name == "thermostand.Temperatures"
     assert [field.name for field in message.DESCRIPTOR.fields][:5] == [
@@ -91,7 +92,7 @@ def test_no_batch_loses_anything(case):
 
 def test_two_axes_share_a_topic_and_keep_their_units_apart():
     topic = messages.KINDS["axis"].topic
-    encoded = messages.BatchEncoder("rotary", messages.KINDS["axis"]).encode(
+    encoded = BatchEncoder("rotary", messages.KINDS["axis"]).encode(
         Batch("rotary", TIME_NS, (Reading("rotary.position", 12.5, "deg", TIME_NS),))
     )
     message = messages.CLASSES[topic].FromString(encoded)
@@ -100,7 +101,7 @@ def test_two_axes_share_a_topic_and_keep_their_units_apart():
 
 
 def test_nan_is_the_same_bytes_whatever_arithmetic_made_it():
-    encoder = messages.BatchEncoder("pt", messages.KINDS["thermometers"])
+    encoder = BatchEncoder("pt", messages.KINDS["thermometers"])
     negative_nan = float(np.copysign(np.nan, -1.0))
 
     def encode(nan):
@@ -112,7 +113,7 @@ def test_nan_is_the_same_bytes_whatever_arithmetic_made_it():
 def test_one_instant_shared_by_a_batch_costs_no_remarks():
     def size(time_ns):
         readings = tuple(Reading(f"pt.{n}", 20.0, "degC", time_ns) for n in ("air", "artifact", "laboratory"))
-        return len(messages.BatchEncoder("pt", messages.KINDS["thermometers"]).encode(Batch("pt", TIME_NS, readings)))
+        return len(BatchEncoder("pt", messages.KINDS["thermometers"]).encode(Batch("pt", TIME_NS, readings)))
 
     assert size(TIME_NS - 5_000_000) - size(TIME_NS) == 9
 

@@ -24,7 +24,7 @@ from recording.writing.forms import telemetry_topics
 from recording.writing.recorder import Recorder
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
-from recording.writing.telemetry import TelemetryEncoder
+from recording.writing.telemetry import BatchEncoder, TelemetryEncoder
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
 
@@ -121,7 +121,7 @@ def batches(draw):
 @given(batches())
 def test_a_batch_read_and_encoded_again_is_the_same_bytes_and_lost_nothing(case):
     kind, original = case
-    encoder = messages.BatchEncoder("dev", messages.KINDS[kind])
+    encoder = BatchEncoder("dev", messages.KINDS[kind])
     data = encoder.encode(original)
     decoded = messages.decode_batch(encoder.topic, data, original.time_ns)
     assert encoder.encode(decoded) == data

@@ -15,11 +15,12 @@ from recording.format.layout import FRAMES, TELEMETRY
 from recording.reading.session import Session
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
+from recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"session_id": "night-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n", "target.yaml": "rows: 6\n"}
-ENCODER = messages.BatchEncoder("thermometers", messages.KINDS["thermometers"])
+ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
 TELEMETRY_TOPICS = (
     Topic(ENCODER.topic, messages.CLASSES[ENCODER.topic], ("thermometers",)),
     *(Topic(name, messages.CLASSES[name]) for name in (messages.CAMERA_META, messages.STEP, messages.EVENT)),

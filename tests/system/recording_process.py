@@ -26,6 +26,7 @@ from recording.format import messages
 from recording.format.images import CAMERA_IMAGE, encode_image
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from recording.writing.segment import Record
+from recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 PERIOD_NS = NS_PER_S // 100
@@ -39,7 +40,7 @@ SETTINGS = RecordingSettings(
 )
 BATCHES = 2
 MESSAGES_PER_ROUND = 1 + BATCHES  # a frame's description is telemetry, too
-ENCODER = messages.BatchEncoder("thermometers", messages.KINDS["thermometers"])
+ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
 PROGRESS = struct.Struct("<QQQQ")  # process (0: it has ended), rounds published, frames and messages saved
 
 
