@@ -26,6 +26,7 @@ from stand.config.interface_section import load_tokens
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.daemon.daemon_desk import DaemonDesk
 from stand.daemon.serve import serve as serve_stand
+from stand.running.order import optics_texts
 from stand.serving.api.bridge import Bridge
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve as serve_clients
@@ -93,6 +94,7 @@ def _attachments(path: Path, stand: StandConfig) -> dict[str, str]:
     """What each session of this stand keeps, by the attachment's name; a stand that was not checked since is
     reported."""
     texts = {"config.yaml": read_document(path), "target.yaml": read_document(packaged("targets", stand.target))}
+    texts |= optics_texts(stand)
     record = load_checked(path)
     warn_unchecked(path, stand, record)
     return texts if record is None else texts | {ATTACHMENT: record.text}

@@ -35,7 +35,7 @@ from stand.running.executing.settling_watch import load_for
 from stand.running.guest import Job
 from stand.running.opening.open_stand import OpenStand
 from stand.running.opening.stop import Interrupted, Stop
-from stand.running.order import Order, check_plan, parse_order
+from stand.running.order import Order, attached_optics, check_plan, parse_order
 from stand.running.resume import Interruption, repaired
 from stand.running.run import run_in
 from stand.running.said import Said, keep
@@ -45,8 +45,8 @@ _SHOWN = 50  # runs that have ended
 
 
 class Orders:
-    """Of the daemon that has `open_stand`. texts: config.yaml, target.yaml and the record of `stand check` where there
-    is one, as they were when it began.
+    """Of the daemon that has `open_stand`. texts: config.yaml, target.yaml, optics of simulated cameras and the record
+    of `stand check` where there is one, as they were when it began.
 
     queued: as it was last read. stop: of the run under way. leaving: the daemon ends, and its run is interrupted by it.
     """
@@ -255,8 +255,13 @@ class Orders:
         """The same on the stand as it is open now."""
         config = self._open_stand.assembly.config
         check_plan(order.recipe.plan(), config)
-        record = self._texts.get(ATTACHMENT, "")
-        return replace(order, config=config, config_text=self._texts["config.yaml"], commissioning_text=record)
+        return replace(
+            order,
+            config=config,
+            config_text=self._texts["config.yaml"],
+            optics_texts=attached_optics(config, self._texts),
+            commissioning_text=self._texts.get(ATTACHMENT, ""),
+        )
 
     def folder_of(self, session: str) -> Path:
         """Missing when there is no session of that name here; it waits for the disk."""

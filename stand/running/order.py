@@ -21,7 +21,7 @@ from stand.config.recipe import Recipe
 from stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
 from stand.estimating.estimate import check_step, price
 
-_REGISTERS = "registers-{}.yaml"  # its name in a session
+_REGISTERS, _OPTICS = "registers-{}.yaml", "optics-{}.yaml"  # their names in a session
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +39,14 @@ class Order:
     attended: bool = False
     at_configured_addresses: bool = False
     register_texts: Mapping[str, str] = field(default_factory=dict[str, str])
+    optics_texts: Mapping[str, str] = field(default_factory=dict[str, str])
     commissioning_text: str = ""
 
     def attachments(self) -> dict[str, str]:
         """The texts by the names under which a session has them."""
         texts = {"config.yaml": self.config_text, "recipe.yaml": self.recipe_text, "target.yaml": self.target_text}
         record = {ATTACHMENT: self.commissioning_text} if self.commissioning_text else {}
-        return texts | dict(self.register_texts) | record
+        return texts | dict(self.register_texts) | dict(self.optics_texts) | record
 
 
 def load_order(recipe: str, config: str) -> Order:
@@ -59,7 +60,12 @@ def load_order(recipe: str, config: str) -> Order:
     order = parse_order(texts, {name: str(path) for name, path in paths.items()})
     try:
         order = with_register_maps(
-            replace(order, config=stand, commissioning_text="" if record is None else record.text)
+            replace(
+                order,
+                config=stand,
+                optics_texts=optics_texts(stand),
+                commissioning_text="" if record is None else record.text,
+            )
         )
     except ConfigError as error:
         raise ConfigError(f"{paths['config.yaml']}: {error}") from error
@@ -91,6 +97,23 @@ def register_texts(config: StandConfig) -> dict[str, str]:
     }
 
 
+def optics_texts(config: StandConfig) -> dict[str, str]:
+    """The optics' files of a stand's simulated cameras as they are now, by names of attachments that end in the
+    camera's; none of built-in optics. ConfigError when one is missing."""
+    simulated = {} if config.simulation is None else config.simulation.cameras
+    return {
+        _OPTICS.format(name): read_document(packaged("optics", str(camera.optics), key=f"optics of {name}"))
+        for name, camera in simulated.items()
+        if camera.is_preset
+    }
+
+
+def attached_optics(config: StandConfig, texts: Mapping[str, str]) -> dict[str, str]:
+    """Those of them that are among the attachments of a session; older ones have none."""
+    simulated = () if config.simulation is None else config.simulation.cameras
+    return {name: texts[name] for name in map(_OPTICS.format, simulated) if name in texts}
+
+
 def check_plan(plan: Iterable[PlannedStep], config: StandConfig) -> None:
     """ConfigError when a step cannot be where it is, or is nothing for this stand."""
     planned = tuple(plan)
@@ -115,13 +138,15 @@ def plan_faults(plan: Sequence[PlannedStep], config: StandConfig) -> Iterator[tu
 def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:
     """The order of these texts, by the names under which a session has them (Order.attachments); `names` are for
     messages. ConfigError when this version of the program refuses one of them."""
+    config = parse_document(texts["config.yaml"], StandConfig, names["config.yaml"])
     order = Order(
-        parse_document(texts["config.yaml"], StandConfig, names["config.yaml"]),
+        config,
         parse_document(texts["recipe.yaml"], Recipe, names["recipe.yaml"]),
         texts["config.yaml"],
         texts["recipe.yaml"],
         texts["target.yaml"],
         register_texts={name: texts[name] for name in map(_REGISTERS.format, (*MAPPED, "inputs")) if name in texts},
+        optics_texts=attached_optics(config, texts),
         commissioning_text=texts.get(ATTACHMENT, ""),
     )
     parse_document(order.target_text, Target, names["target.yaml"])

@@ -9,7 +9,7 @@ from foundation.documents import parse_document
 from foundation.errors import ConfigError
 from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, packaged
-from stand.running.order import load_order
+from stand.running.order import load_order, parse_order
 
 STAND = packaged("", "laboratory").read_text(encoding="utf-8")
 
@@ -155,6 +155,23 @@ def test_files_beside_the_one_that_names_them_are_found_from_anywhere(tmp_path: 
     assert order.config.regulator.registers == str(tmp_path / "maps" / "ours.yaml")
     assert "OURS" in order.register_texts["registers-regulator.yaml"]
     assert "maps/ours.yaml" in order.config_text
+
+
+def test_a_session_keeps_the_optics_of_its_simulated_cameras(tmp_path: Path):
+    """Those of a file, as it is when the run begins; a session without them, of before, is read as well."""
+    optics = packaged("optics", "nac").read_text(encoding="utf-8") + "# ours\n"
+    (tmp_path / "ours.yaml").write_text(optics)
+    text = packaged("", "simulated").read_text(encoding="utf-8")
+    file = tmp_path / "mine.yaml"
+    cameras = "simulation:\n  cameras: {camera: {optics: ours.yaml, drawn: 7}}\n"
+    file.write_text(text.replace("simulation:\n", cameras))
+    texts = load_order("demo", str(file)).attachments()
+    assert texts["optics-camera.yaml"] == optics
+    names = dict.fromkeys(texts, "attached")
+    assert parse_order(texts, names).attachments() == texts
+    del texts["optics-camera.yaml"]
+    assert parse_order(texts, names).attachments() == texts
+    assert not load_order("demo", "simulated").optics_texts
 
 
 @pytest.mark.parametrize("above", ["", "guard:\n", "cameras:\n camera:\n"])
