@@ -13,28 +13,61 @@ centres of a band of half the width, and a quarter of the squared misfit of the 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from markers.edge_fit import EdgeFit
 from markers.edge_model import Float
+from markers.sandwich import variance_growth, variance_ratio
 
 WIDE_SIGMA, NARROW_SIGMA = 9.0, 4.5
 """Half widths of the band in blurs."""
 WIDE_EXCESS = (WIDE_SIGMA / NARROW_SIGMA) ** 2
-_DOUBTFUL_GROWTH = 1.3
+_DOUBTFUL_GROWTH, _SUSPECT_GROWTH = 1.4, 1.3
+"""Along x or y alone, as rows that flicker have it."""
+_DOUBTFUL_TOGETHER, _SUSPECT_TOGETHER = 0.35, 0.3
+"""Growth along x and y and of the levels' variance: each scatters by itself where there is only noise, and they grow
+together where residuals hang together: 0.05 +- 0.09 by noise alone (54 markers), 0.59 +- 0.12 by JPEG of quality 90."""
+_DOUBTFUL_CHANCES = 3.0
 _DOUBTFUL_LEVELS = 1.3
 _BEYOND_CHANCE = 1.5
 """Of a mean square over a frame's markers, 54 of them: chance reaches it once in a hundred frames."""
 
 
-def is_doubtful(fit: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> bool:
-    """Whether residuals hang together, round the outlines (`growth`, sandwich.py) or in the levels beside them: what is
-    seen is not what the noise model describes."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Strangeness:
+    """How much the residuals of a frame hang together, each 0 (levels: 1) where there is noise alone. along: growth of
+    variance along x or y, the larger. together: that of x and y, their mean, and of the levels. chance: standard
+    deviation of `together`'s first part. levels: root mean square of the sectors' levels. growth: (2,), of the
+    variances along x and y (sandwich.py)."""
+
+    growth: Float
+    along: float
+    together: float
+    chance: float
+    levels: float
+
+    def is_doubtful(self) -> bool:
+        """Whether what is seen is not what the noise model describes. Of 100 frames of noise alone at most one."""
+        limit = max(_DOUBTFUL_TOGETHER, _DOUBTFUL_CHANCES * self.chance)
+        return self.along > _DOUBTFUL_GROWTH - 1 or self.together > limit or self.levels > _DOUBTFUL_LEVELS
+
+    def is_suspect(self) -> bool:
+        """Whether it may be doubtful, if this is from a sample of the markers: then it takes all to decide."""
+        return self.along > _SUSPECT_GROWTH - 1 or self.together > _SUSPECT_TOGETHER or self.levels > _DOUBTFUL_LEVELS
+
+
+def strangeness(fit: EdgeFit, clean: NDArray[np.bool_]) -> Strangeness:
+    """Of the `clean` (N,) markers."""
     if not clean.any():
-        return False
+        return Strangeness(np.ones(2), 0.0, 0.0, 0.0, 1.0)
     levels = float(np.median(fit.levels[clean] / fit.chi[clean]))
-    return bool(growth.max() > _DOUBTFUL_GROWTH) or levels > _DOUBTFUL_LEVELS
+    ratio, chance = variance_ratio(fit.scatter, clean)
+    growth = variance_growth(ratio, chance)
+    together = float(ratio.mean()) - 1 + levels**2 - 1
+    return Strangeness(growth, float(growth.max()) - 1, together, float(np.linalg.norm(chance)) / 2, levels)
 
 
 def excess_px2(wide: EdgeFit, narrow: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> Float:

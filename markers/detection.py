@@ -15,12 +15,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.band import NARROW_SIGMA, WIDE_EXCESS, WIDE_SIGMA, excess_px2, is_doubtful
+from markers.band import NARROW_SIGMA, WIDE_EXCESS, WIDE_SIGMA, Strangeness, excess_px2, strangeness
 from markers.bootstrap import Candidates, disc_sizes_px, find_candidates
 from markers.edge_fit import EdgeFit, Flag, fit_edges
 from markers.edge_model import B0, F0, M11, M12, M22, SIGMA, EdgeState
@@ -29,7 +31,7 @@ from markers.grid import DetectionError, Identified, expected_px, fit_homography
 from markers.light import under_common_light
 from markers.noise import Image, Noise
 from markers.refit import refit_edges
-from markers.sandwich import variance_growth
+from markers.sandwich import SAMPLED_MARKERS
 from markers.target import Target
 
 __all__ = [
@@ -113,7 +115,8 @@ def detect(
             raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
         if _still_there(grey, previous, _reach(target)[:, :1]):
             with suppress(DetectionError):
-                tracked = _fit_in_band(grey, target, previous.state, noise, previous.band_sigma)
+                sampled = target.count if previous.is_doubtful else SAMPLED_MARKERS
+                tracked = _fit_in_band(grey, target, previous.state, noise, previous.band_sigma, sampled)
                 if tracked is not None and _has_followed(tracked[0], previous):
                     return _doubted(tracked[0], previous.excess_px2)
     return _search(grey, target, None if previous is None else previous.homography, noise, watch)
@@ -197,7 +200,7 @@ def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> 
     wide, fit = found
     if not wide.is_doubtful:
         return wide
-    again = _fit_in_band(grey, target, wide.state, noise, NARROW_SIGMA)
+    again = _fit_in_band(grey, target, wide.state, noise, NARROW_SIGMA, target.count)
     if again is None:
         return wide
     narrow, narrow_fit = again
@@ -207,11 +210,17 @@ def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> 
 
 
 def _fit_in_band(
-    grey: Image, target: Target, start: EdgeState, noise: Noise | None, band_sigma: float
+    grey: Image,
+    target: Target,
+    start: EdgeState,
+    noise: Noise | None,
+    band_sigma: float,
+    sampled: int = SAMPLED_MARKERS,
 ) -> tuple[Detection, EdgeFit] | None:
-    """The fit from `start`, judged; None when fewer markers than the target demands have a credible centre."""
+    """The fit from `start`, judged; None when fewer markers than the target demands have a credible centre. sampled:
+    how many markers say whether residuals hang together, at first."""
     model = noise or Noise()
-    fit = fit_edges(grey, start, model, _reach(target), band_sigma)
+    fit = fit_edges(grey, start, model, _reach(target), band_sigma, sampled)
     good = np.isfinite(fit.chi) & _has_contrast(fit.state, target, model)
     if good.sum() < target.least_markers:
         return None
@@ -223,7 +232,9 @@ def _fit_in_band(
     if placed.sum() < good.sum():
         homography = fit_homography(target.coordinates_mm()[placed], fit.state.centres_px()[placed])
         expected = expected_edges(homography, target)
-    detection = _judged(fit, placed, homography, expected, band_sigma, relative=noise is None)
+    detection, strange = _judged(fit, placed, homography, expected, band_sigma, relative=noise is None)
+    if sampled < target.count and strange.is_suspect():
+        return _fit_in_band(grey, target, fit.state, noise, band_sigma, target.count)
     return _refitted(detection, fit, grey, target, model), fit
 
 
@@ -238,13 +249,13 @@ def _doubted(detection: Detection, excess: Float) -> Detection:
 
 def _judged(
     fit: EdgeFit, good: NDArray[np.bool_], homography: Float, expected: EdgeState, band_sigma: float, relative: bool
-) -> Detection:
+) -> tuple[Detection, Strangeness]:
     """The detection of a fit whose markers are `good` or missing; missing ones are `expected` where the others say."""
     chi, misfit = np.where(good, fit.chi, np.nan), np.where(good, fit.misfit, np.nan)
-    usual = max(float(np.nanmedian(chi)), 1e-9)
+    usual = max(float(np.median(fit.chi[good])), 1e-9)
     # A print or a lens that the model does not know makes all markers worse; a bad one is worse than the others.
     poor = (chi > _POOR_CHI * (usual if relative else max(usual, 1.0))) | (
-        misfit > _POOR_MISFIT * max(float(np.nanmedian(misfit)), usual if relative else 1.0)
+        misfit > _POOR_MISFIT * max(float(np.median(fit.misfit[good])), usual if relative else 1.0)
     )
     if relative:
         chi = chi / usual
@@ -254,10 +265,10 @@ def _judged(
     parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
     believed = good & ~poor
     centres, covariance = under_common_light(fit, believed)
-    growth = variance_growth(fit.scatter, believed)
-    return Detection(
+    strange = strangeness(fit, believed)
+    found = Detection(
         centres_px=np.where(good[:, None], centres, np.nan),
-        covariance_px2=np.where(good[:, None, None], _grown(covariance, growth), np.nan),
+        covariance_px2=np.where(good[:, None, None], _grown(covariance, strange.growth), np.nan),
         flags=flags.astype(np.uint8),
         chi=chi,
         homography=homography,
@@ -265,11 +276,12 @@ def _judged(
             np.where(good[:, None], fit.state.parameters, parameters),
             np.where(good, fit.state.scale_px, expected.scale_px * scale),
         ),
-        growth=growth,
+        growth=strange.growth,
         excess_px2=np.zeros(2),
         band_sigma=band_sigma,
-        is_doubtful=is_doubtful(fit, growth, believed),
+        is_doubtful=strange.is_doubtful(),
     )
+    return found, strange
 
 
 def _grown(covariance: Float, growth: Float) -> Float:
@@ -304,13 +316,19 @@ def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, n
     return detection
 
 
-def _reach(target: Target) -> Float:
-    """From where to where, in radii, a marker's pixels lie (N, 2): half way to the nearest other edge."""
+def _reach_of(target: Target) -> Float:
+    """Read-only: from where to where, in radii, a marker's pixels lie (N, 2): half way to the nearest other edge."""
     centres, radii = target.coordinates_mm(), target.diameters_mm() / 2
     gap = np.linalg.norm(centres[:, None] - centres[None], axis=2) - radii[:, None] - radii[None]
     np.fill_diagonal(gap, np.inf)
     inwards = np.where(target.is_donut(), (1 + np.sqrt(target.hole_part)) / 2, 0.0)
-    return np.stack([inwards, 1 + gap.min(axis=1) / (2 * radii)], axis=1)
+    reach = np.stack([inwards, 1 + gap.min(axis=1) / (2 * radii)], axis=1)
+    reach.flags.writeable = False
+    return reach
+
+
+_reach = cast("Callable[[Target], Float]", lru_cache(maxsize=16)(_reach_of))
+"""The same for each frame of a target."""
 
 
 def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.bool_]:

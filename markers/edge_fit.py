@@ -81,10 +81,18 @@ class EdgeFit:
         return self.covariance[:, :2, :2]
 
 
-def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float, band_sigma: float = 9.0) -> EdgeFit:
+def fit_edges(
+    image: Image,
+    start: EdgeState,
+    noise: Noise,
+    reach: Float,
+    band_sigma: float = 9.0,
+    sampled: int = SAMPLED_MARKERS,
+) -> EdgeFit:
     """Fit every marker of `start`. `reach` (N, 2): from where to where, in radii from the centre, a marker's pixels may
     lie, so that its band ends half way to its hole and to the neighbours. band_sigma: half width of the band, blurs.
-    The image is only read. Raises ValueError for images that are not contiguous.
+    sampled: about how many markers are looked at for `scatter`. The image is only read. Raises ValueError for images
+    that are not contiguous.
     """
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
@@ -97,7 +105,7 @@ def fit_edges(image: Image, start: EdgeState, noise: Noise, reach: Float, band_s
     _fit_all(
         bytes_of(image), parameters, start.scale_px, np.asarray(reach, np.float64),
         (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start, band_sigma)),
-        band_sigma,
+        band_sigma, max(1, count // sampled),
         covariance, quality, scatter, flags,
     )  # fmt: skip
     return EdgeFit(
@@ -122,16 +130,16 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
         ceiling: int,
         pixels: Pixels,
         band_sigma: float,
+        every: int,
         covariance: Float,
         quality: Float,
         scatter: Float,
         flags: NDArray[np.uint8],
     ) -> None:
-        """Fit each row of `parameters` in place; chi and misfit into `quality` (N, 2)."""
+        """Fit each row of `parameters` in place; chi and misfits into `quality` (N, 3)."""
         _ = sources
         work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
         belief = no_belief()
-        every = max(1, len(scale) // SAMPLED_MARKERS)
         scatter[:] = math.nan
         for n in range(len(scale)):
             p = parameters[n].copy()

@@ -48,7 +48,8 @@ _LEAST_ARC_px = 3.0
 """Residuals nearer than this hang together by the blur and by the colour filter alone."""
 
 SAMPLED_MARKERS = 27
-"""Of a frame, evenly spread: they determine the growth of its variances to 16 %, at half of the time of all."""
+"""Of a frame, evenly spread: they determine the growth of its variances to 16 %, at half of the time of all, which are
+looked at where the sample is conspicuous (band.py)."""
 _LEAST_MARKERS = 8
 """With fewer the growth of a frame's variances is a guess."""
 _DOUBT_OF_LESS = 2.0
@@ -155,20 +156,25 @@ def _add_block(seen: Single, size: int, sums: Float) -> None:
                 sums[axis, row, cluster] += found[row]
 
 
-def variance_growth(scatter: Float, clean: NDArray[np.bool_]) -> Float:
-    """By what the variances of a frame's centres grow (2,), along x and y: the sums over its `clean` (N,) markers of
-    the robust over the independent ones of `scatter` (N, 2, 2), NaN for markers that were not looked at.
+def variance_ratio(scatter: Float, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """The sums over a frame's `clean` (N,) markers of the robust over the independent variances of `scatter`
+    (N, 2, 2), NaN for markers that were not looked at, along x and y (2,), and the standard deviations that chance
+    gives these ratios (2,). 1 and infinite where the markers are few."""
+    seen = scatter[clean & np.isfinite(scatter[:, 0, 0])]
+    robust, independent = seen[:, 0], seen[:, 1]
+    if len(robust) < _LEAST_MARKERS:
+        return np.ones(2), np.full(2, np.inf)
+    whole = independent.sum(axis=0)
+    ratio = robust.sum(axis=0) / whole
+    return ratio, np.sqrt(np.sum((robust - ratio * independent) ** 2, axis=0)) / whole
+
+
+def variance_growth(ratio: Float, chance: Float) -> Float:
+    """By what the variances of a frame's centres grow (2,), along x and y, for a `variance_ratio`.
 
     Pulled to 1 where it could be chance (James and Stein): independent noise keeps the covariance that it has. To
     claim less than that takes twice the evidence.
     """
-    seen = scatter[clean & np.isfinite(scatter[:, 0, 0])]
-    robust, independent = seen[:, 0], seen[:, 1]
-    if len(robust) < _LEAST_MARKERS:
-        return np.ones(2)
-    whole = independent.sum(axis=0)
-    ratio = robust.sum(axis=0) / whole
-    chance = np.sqrt(np.sum((robust - ratio * independent) ** 2, axis=0)) / whole
     beyond = ratio - 1
     doubt = np.where(beyond < 0, _DOUBT_OF_LESS, 1.0) * chance
     return 1 + beyond * np.maximum(1 - (doubt / np.where(beyond == 0, 1.0, beyond)) ** 2, 0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from statistics import mean
 
 import cv2
 import numpy as np
@@ -28,9 +29,11 @@ from tests.compensation.spoiled import (
     with_gamma,
 )
 
-FRAMES = 8
+FRAMES = 24
+CLEAN_FRAMES = 100
 FIRST_SEED = 7000
 GOAL = 1.25
+_FALSE_ALARMS = 0.01
 SCENES = {
     "17 px": Scene(size=(1224, 1024), f_px=4386, roll_deg=31, tilt_x_deg=-14, distance_mm=1150),
     "10 px": Scene(size=(1224, 1024), f_px=2700, roll_deg=12, tilt_y_deg=-20, distance_mm=1080),
@@ -58,7 +61,19 @@ def figures(directory: Path) -> list[Figure]:
         for blur in (0.6, 2.5):
             blurred = replace(scene, psf_px=blur)
             lines.append(_figure(f"blur {blur} px, discs of {size}", blurred, render(blurred), noise_alone))
-    return lines
+    return [*lines, _false_alarms()]
+
+
+def _false_alarms() -> Figure:
+    """Frames of noise alone, none of them in the lines above, that are said to be doubtful."""
+    target = load_target(packaged("targets", "paper-9x6"))
+    doubtful: list[bool] = []
+    for number, (size, scene) in enumerate(SCENES.items()):
+        progress(f"false alarms, discs of {size}")
+        clean, first = render(scene), FIRST_SEED + 1000 * (number + 1)
+        found = [detect(noise_alone(scene, clean, seed), target) for seed in range(first, first + CLEAN_FRAMES)]
+        doubtful += [detection.is_doubtful for detection in found]
+    return at_most(_FALSE_ALARMS, absolute(f"doubtful of {len(doubtful)} frames of noise alone", "", [mean(doubtful)]))
 
 
 def _figure(name: str, scene: Scene, clean: Float, picture: Picture) -> Figure:
