@@ -13,11 +13,15 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """Grey image, shape (height, width), [row, column]."""
 Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
 
 _DEPTHS_bit = (8, 10, 12, 14, 16)
 _BINS = 16
 _LEAST_PIXELS = 1000
 _EDGE_px = 7
+_MEAN_px = 5
+_MEANS_PER_DN = 2 * _MEAN_px**2
+"""Of two images of whole DN, over squares of so many pixels."""
 _FLAT_PART = 0.02
 _FLAT_SIGMA = 0.5
 _ROUNDING_DN2 = 1 / 12
@@ -76,15 +80,28 @@ def estimate_noise(images: Sequence[Image], windows: NDArray[np.int32] | None = 
     signal, noise = (np.concatenate(values) for values in zip(*pairs, strict=True))
     if len(signal) < _LEAST_PIXELS:
         return None
-    bins = np.array_split(np.argsort(signal, kind="stable"), _BINS)
-    means = np.array([signal[part].mean() for part in bins])
-    variances = np.maximum([_clipped_variance(noise[part]) for part in bins], _ROUNDING_DN2)
+    bins = np.array_split(_order(signal), _BINS)
+    means = np.array([signal[part].astype(np.float64).mean() for part in bins])
+    variances = np.maximum([_clipped_variance(noise[part].astype(np.float64)) for part in bins], _ROUNDING_DN2)
     return _line(means, variances)
 
 
-def _pair(one: Image, two: Image, windows: NDArray[np.int32] | None) -> tuple[Float, Float]:
+def _order(signal: Float32) -> NDArray[np.int64]:
+    """np.argsort(signal, kind="stable"). The means of 8-bit pixels have few values, whose numbers NumPy sorts by their
+    digits: a third of the time for millions of them."""
+    numbers = np.rint(signal * _MEANS_PER_DN)
+    if numbers.max() <= np.iinfo(np.uint16).max:
+        keys = numbers.astype(np.uint16)
+        values = np.zeros(int(keys.max()) + 1, np.float32)
+        values[keys] = signal
+        if np.array_equal(values[keys], signal):
+            return np.argsort(keys, kind="stable")
+    return np.argsort(signal, kind="stable")
+
+
+def _pair(one: Image, two: Image, windows: NDArray[np.int32] | None) -> tuple[Float32, Float32]:
     """Signal, and a sample of the noise of one pixel, for pairs of neighbours on even ground."""
-    mean = cv2.blur(cv2.addWeighted(one, 0.5, two, 0.5, 0, dtype=cv2.CV_32F), (5, 5))
+    mean = cv2.blur(cv2.addWeighted(one, 0.5, two, 0.5, 0, dtype=cv2.CV_32F), (_MEAN_px, _MEAN_px))
     box = np.ones((_EDGE_px, _EDGE_px), np.uint8)
     change = cv2.dilate(mean, box) - cv2.erode(mean, box)
     flat = change < _FLAT_PART * float(mean.max() - mean.min()) + _FLAT_SIGMA * float(np.sqrt(np.median(mean) + 1))
@@ -97,10 +114,10 @@ def _pair(one: Image, two: Image, windows: NDArray[np.int32] | None) -> tuple[Fl
     even = slice(0, one.shape[1] // 2 * 2, 2)
     odd = slice(1, one.shape[1] // 2 * 2, 2)
     chosen = flat[:, even] & flat[:, odd]
-    difference = one.astype(np.float32) - two
+    difference: Float32 = np.subtract(one, two, dtype=np.float32)
     return (
-        mean[:, even][chosen].astype(np.float64),
-        0.5 * (difference[:, even][chosen] - difference[:, odd][chosen]).astype(np.float64),
+        mean[:, even][chosen].astype(np.float32),
+        np.divide(difference[:, even][chosen] - difference[:, odd][chosen], 2, dtype=np.float32),
     )
 
 

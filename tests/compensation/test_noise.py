@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from markers.noise import estimate_noise, full_scale_DN
+from markers.noise import _order, estimate_noise, full_scale_DN
 
 from .rendered import Scene, photograph, render, shaded_light
 
@@ -22,6 +22,13 @@ def test_read_noise_and_shot_noise_are_found_while_the_target_drifts(read_DN, el
     for signal_DN in (30.0, 150.0):
         expected = read_DN**2 + 1 / 12 + signal_DN / electrons_per_DN
         assert noise.variance_DN2(np.array(signal_DN)) == pytest.approx(expected, rel=0.04)
+
+
+@pytest.mark.parametrize("values", [np.arange(12_500) / 50, np.arange(200_000) / 50, np.array([0.01, 0.013, 255.0])])
+def test_means_are_put_in_the_order_of_a_stable_sort(values):
+    """Of 8 bit, of 12 bit, and such as no mean of whole pixels is."""
+    signal = np.random.default_rng(1).choice(values, 5000).astype(np.float32)
+    assert np.array_equal(_order(signal), np.argsort(signal, kind="stable"))
 
 
 def test_light_that_changed_between_the_images_does_not_count_as_noise():
