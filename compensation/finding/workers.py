@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkstemp
 from typing import Any
@@ -34,7 +35,11 @@ def in_turn(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
 
 def in_processes(workers: int) -> Work:
     """So many processes, each with one thread. What a process that was killed had not finished is done again by
-    another; SessionError when that does not help."""
+    another; SessionError when that does not help.
+
+    The process that they are forked from loads what they need from now on, while this one makes the pieces."""
+    multiprocessing.set_forkserver_preload([find_markers.__module__])
+    ensure_running()
 
     def work(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
         left, tries = set(range(len(pieces))), 0
@@ -92,7 +97,6 @@ def _pool(workers: int) -> Generator[ProcessPoolExecutor]:
     """Forked from a process of their own kind that has loaded what they need, once for all pools (a fork of this one
     would copy its threads' locks); what is not begun is dropped on any early way out."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([find_markers.__module__])
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     try:
         yield pool
