@@ -17,7 +17,7 @@ import ctypes
 import errno
 import fcntl
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,9 +50,12 @@ CHUNK_BYTES = 1024 * 1024
 _KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE, linux/falloc.h
 _NO_RESERVE = (errno.EOPNOTSUPP, errno.ENOSYS)  # a file system that cannot reserve is written to without
 _PARTS_AT_ONCE = 1024  # IOV_MAX
+_PIECE_BYTES = 1 << 18
+_BEGIN_WRITING = 2  # SYNC_FILE_RANGE_WRITE, linux/fs.h: the disk is given what is there, and nobody waits for it
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.fallocate64.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
+_libc.sync_file_range.argtypes = (ctypes.c_int, ctypes.c_int64, ctypes.c_int64, ctypes.c_uint)
 
 
 class Record(NamedTuple):
@@ -360,13 +363,34 @@ def _reserve(fd: int, size_bytes: int) -> None:
 
 
 def _write(fd: int, parts: Sequence[bytes], offset: int) -> int:
-    """Write all parts, one behind the other, from `offset`; returns where they end."""
-    rest = [memoryview(part) for part in parts if part]
-    while rest:  # a nearly full disk takes a part of the block before it refuses
-        written = os.pwritev(fd, rest[:_PARTS_AT_ONCE], offset)
-        offset += written
-        while rest and written >= len(rest[0]):
-            written -= len(rest.pop(0))
-        if written:
-            rest[0] = rest[0][written:]
+    """Write all parts, one behind the other, from `offset`; returns where they end. The disk begins with a piece while
+    the next one is copied: a frame that is handed over at once waits for the copy of all of it first."""
+    for piece in _pieces(parts):
+        begin = offset
+        while piece:  # a nearly full disk takes a part of the piece before it refuses
+            written = os.pwritev(fd, piece, offset)
+            offset += written
+            while piece and written >= len(piece[0]):
+                written -= len(piece.pop(0))
+            if written:
+                piece[0] = piece[0][written:]
+        if offset - begin >= _PIECE_BYTES:
+            _libc.sync_file_range(fd, begin, offset - begin, _BEGIN_WRITING)  # an error is fdatasync's to report
     return offset
+
+
+def _pieces(parts: Sequence[bytes]) -> Iterator[list[memoryview]]:
+    """The parts' bytes in their order, in pieces of at most _PIECE_BYTES and _PARTS_AT_ONCE parts."""
+    piece: list[memoryview] = []
+    room = _PIECE_BYTES
+    for part in parts:
+        rest = memoryview(part)
+        while rest:
+            piece.append(rest[:room])
+            room -= len(piece[-1])
+            rest = rest[len(piece[-1]) :]
+            if not room or len(piece) == _PARTS_AT_ONCE:
+                yield piece
+                piece, room = [], _PIECE_BYTES
+    if piece:
+        yield piece

@@ -50,6 +50,15 @@ def test_a_reserve_is_taken_at_once_is_no_part_of_the_size_and_is_given_back(dis
     assert (disk / "file").stat().st_size == 1500
 
 
+def test_a_block_of_several_pieces_is_written_whole(disk):
+    parts = [bytes([number % 251]) * size for number, size in enumerate((300_000, 7, 0, 900_000, *[3] * 3000))]
+    sink = CommitSink(disk / "file")
+    sink.append(parts)
+    sink.append(parts[:1])
+    sink.close()
+    assert (disk / "file").read_bytes() == b"".join(parts) + parts[0]
+
+
 def test_a_block_the_disk_refuses_is_cut_off_again_and_the_reserve_with_it(disk, limited):
     sink = CommitSink(disk / "file", 20 * MB)
     sink.append([b"a" * 1000])
