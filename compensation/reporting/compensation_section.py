@@ -12,7 +12,15 @@ from compensation.observations import Observations
 from compensation.reporting.drawing import fit_figures as figures
 from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.drawing.path_figures import EXAGGERATION
-from compensation.reporting.numbers import FormulaNumbers, ModelNumbers, Numbers, ScoreNumbers, compact, percent
+from compensation.reporting.numbers import (
+    FormulaNumbers,
+    ModelNumbers,
+    Numbers,
+    ScoreNumbers,
+    compact,
+    percent,
+    typeset,
+)
 from compensation.reporting.page import Drawing, Facts, Heading, Listing, Paragraph, Part, Table
 
 _FORMS = {
@@ -20,6 +28,7 @@ _FORMS = {
     "thermal": "displacement to the reference = the motions of a homography, each linear in the camera's thermal state",
 }
 _MOST_THERMAL = 10
+_WIDE = 0.98
 _COMMON = "homography x (1, T, T^2), "
 """Of every thermal form, said once."""
 
@@ -82,7 +91,7 @@ def model_section(model: ModelNumbers) -> Iterator[Part]:
     yield Facts(
         [
             ("Form", f"{model.form}: {_FORMS[model.form]}"),
-            ("In use", model.title),
+            ("In use", typeset(model.title)),
             ("Reference", f"camera {model.reference_degC:.2f} °C, chamber {model.reference_chamber_degC:g} °C"),
             (
                 "Valid for",
@@ -98,7 +107,7 @@ def model_section(model: ModelNumbers) -> Iterator[Part]:
         "Leave-temperatures-out: each chamber set-point with all its visits is predicted from the others. In use is "
         "the simplest of each form within one standard error of the best, or the one asked for; the thermal form takes "
         "the paper's place when it is better by more than one standard error. Every thermal form is a homography times "
-        "1, T, T^2 (T: the camera's temperature) and what is listed.",
+        "1, T, T² (T: the camera's temperature) and what is listed.",
         aside=True,
     )
     yield from _candidates(model)
@@ -113,8 +122,18 @@ def _formula(formula: FormulaNumbers) -> Iterator[Part]:
         (name, *(compact(value, u) for value, u in zip(values.tolist(), sigmas.tolist(), strict=True)))
         for name, values, sigmas in pairs
     ]
-    yield Table(("coefficient", *formula.heads), rows)
-    yield Paragraph("In brackets: the standard uncertainty of the last digits, by the fit.", aside=True)
+    heads = ("coefficient of", *formula.heads)
+    if formula.reference:
+        heads = ("coefficient of f", "r", *formula.heads)
+        at = (typeset(f"{value:z.4f}") for value in formula.reference)
+        rows = [(name, value, *rest) for (name, *rest), value in zip(rows, at, strict=True)]
+    yield Table(heads, rows)
+    yield Paragraph(
+        "In brackets: the standard uncertainty of the last digits, by the fit. The coefficients are correlated "
+        "with each other, and rounded here: to compute with them take all digits, from the file beside this page or "
+        "the model.",
+        aside=True,
+    )
 
 
 def _candidates(model: ModelNumbers) -> Iterator[Part]:
@@ -144,7 +163,7 @@ def _why(model: ModelNumbers) -> str:
 
 
 def _candidate(one: Candidate) -> tuple[str, ...]:
-    name = f"{one.form}: {one.name.removeprefix(_COMMON)}"
+    name = f"{one.form}: {typeset(one.name.removeprefix(_COMMON))}"
     rms = (f"{1e3 * value:.1f}" for value in one.rms_px)
     return (name, str(one.terms), *rms)
 
@@ -165,6 +184,12 @@ def uncertainty_section(numbers: Numbers) -> Iterator[Part]:
             ("part within the claimed 95 % interval", *(percent(100 * part) for part in score.coverage_95)),
         ],
     )
+    if score.coverage_95[0] > _WIDE and score.coverage_95[1] > _WIDE:
+        yield Paragraph(
+            f"More than the claimed 95 % are within: at these {len(score.temperatures)} temperatures the interval is "
+            "wider than it had to be. It stands for other nights and other ways to a temperature too, which these do "
+            "not show."
+        )
     if len(model.session_ids) == 1:
         yield Paragraph(
             "Of one night. What differs between nights is estimated from how its set-points agree: a dead zone in a "

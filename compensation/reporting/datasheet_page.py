@@ -14,7 +14,7 @@ from compensation.datasheet.quantity import COVERAGE, Quantity
 from compensation.reporting.drawing import datasheet_figures as figures
 from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.equipment import Line, stated
-from compensation.reporting.numbers import measured, percent, significant
+from compensation.reporting.numbers import measured, percent, significant, typeset
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 
 FORMAT = "thermostand datasheet 1"
@@ -87,7 +87,8 @@ def _parts(title: str, sheet: Datasheet, equipment: Sequence[Line]) -> Iterator[
     yield Paragraph(
         "U is the expanded uncertainty: the combined standard uncertainty times k = 2, about 95 % of a normal "
         "distribution. Shifts are of the image's middle, I to the right and J down. Scale is a relative change of the "
-        "whole image about its middle, as by a longer focal length."
+        "whole image about its middle, as by a longer focal length. A part of the shift above 100 % is one that "
+        "the other part works against."
     )
     yield from _figures(sheet)
     yield Heading("Valid for")
@@ -125,9 +126,12 @@ def _results(quantities: Sequence[Quantity]) -> Iterator[tuple[str, ...]]:
 
 
 def _unknown(quantities: Sequence[Quantity]) -> Iterator[Part]:
-    reasons = dict.fromkeys(one.why for one in quantities if one.why)
-    if reasons:
-        yield Paragraph(f"Not measured: {'; '.join(reasons)}.")
+    reasons: dict[str, list[str]] = {}
+    for one in quantities:
+        if one.why:
+            reasons.setdefault(one.why, []).append(one.name)
+    for why, names in reasons.items():
+        yield Paragraph(f"Not measured: {'; '.join(names)}. The reason: {why}.")
 
 
 def _figures(sheet: Datasheet) -> Iterator[Part]:
@@ -161,7 +165,7 @@ def _software(sheet: Datasheet) -> list[Line]:
     recorded = dict.fromkeys(one.software_version for one in sheet.observations.sessions)
     return [
         ("Sessions", ", ".join(one.session_id for one in sheet.observations.sessions)),
-        ("Model in use", f"{sheet.model.form}: {sheet.model.title}"),
+        ("Model in use", typeset(f"{sheet.model.form}: {sheet.model.title}")),
         ("Software", ", ".join(f"{name} {version}" for name, version in _versions().items())),
         ("Recorded by", f"thermostand {', '.join(recorded)}"),
     ]

@@ -24,7 +24,33 @@ _DEVICES = (
 
 def equipment_of(session: Session) -> list[Line]:
     """Names and what belongs to them; only what is known."""
-    return [*_exposure(session), *_stand(session)]
+    identities = [*_identities(session)]
+    return [*_exposure(session), *identities, *_stand(session, are_named=bool(identities))]
+
+
+def _identities(session: Session) -> Iterator[Line]:
+    """What each device said of itself, or its register map of it, the last time; the camera of these frames first."""
+    found: dict[str, dict[str, Any]] = {}
+    for event in session.events():
+        if event.kind == "device_identity":
+            found[str(event.data["device"])] = dict(event.data)
+    own = found.pop(session.camera, None)
+    if own is not None:
+        yield "Camera", _identity(own)
+        if own.get("lens"):
+            yield "Lens in the stand's file", str(own["lens"])
+    for name, data in found.items():
+        if "lens" not in data:  # else it is another camera
+            yield f"Device {name.replace('_', ' ')}", _identity(data)
+
+
+def _identity(data: dict[str, Any]) -> str:
+    facts = (
+        " ".join(str(data[key]) for key in ("vendor", "model") if data.get(key)),
+        f"serial number {data['serial_number']}" if data.get("serial_number") else "",
+        f"version {data['version']}" if data.get("version") else "",
+    )
+    return ", ".join(text for text in facts if text)
 
 
 def _exposure(session: Session) -> Iterator[Line]:
@@ -43,7 +69,8 @@ def _range(low: float, high: float, unit: str) -> str:
     return f"{low:g} {unit}" if low == high else f"{low:g} to {high:g} {unit}"
 
 
-def _stand(session: Session) -> Iterator[Line]:
+def _stand(session: Session, *, are_named: bool) -> Iterator[Line]:
+    """are_named: whether the devices have said what they are; else it is taken from the stand's file."""
     text = session.attachment("config.yaml")
     try:
         data: Any = yaml_data(text or "", "config.yaml")
@@ -53,7 +80,7 @@ def _stand(session: Session) -> Iterator[Line]:
         return
     if data.get("name"):
         yield "Stand", str(data["name"])
-    for key, name in _DEVICES:
+    for key, name in () if are_named else _DEVICES:
         device = data.get(key)
         if isinstance(device, dict):
             kind = device.get("registers") or device.get("protocol") or device.get("kind") or "of the stand's file"
@@ -75,7 +102,7 @@ def _sensor(name: object, sensor: Any) -> str:
 
 def stated(details: Details, target: Target) -> list[Line]:
     """What somebody has stated, and which of what a reader asks for nobody has."""
-    distance = "" if details.working_distance_mm is None else f"{details.working_distance_mm:g} mm"
+    distance = "" if details.working_distance_mm is None else f"target {details.working_distance_mm:g} mm away"
     rows = [
         ("Lens", ", ".join(text for text in (details.lens, details.aperture, distance) if text)),
         ("Mount", details.mount),

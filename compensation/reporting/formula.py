@@ -44,19 +44,29 @@ def _paper(model: PaperModel) -> FormulaNumbers:
 def _thermal(model: ThermalModel) -> FormulaNumbers:
     width, height = model.facts.image_size
     origin, air = model.facts.reference_degC, model.reference_ambient_degC
+    kinds = {term.kind for term in model.terms}
     lines = (
         "I at the reference = I + a₁ + a₃ x + a₄ y + (a₇ x + a₈ y) x",
         "J at the reference = J + a₂ + a₅ x + a₆ y + (a₇ x + a₈ y) y",
         f"x = (I − {(width - 1) / 2:g}) / {width / 2:g},  y = (J − {(height - 1) / 2:g}) / {width / 2:g}",
-        "a_k = Σ c_kh (f_h − f_h at the reference),  f_h: the rows of the table",
+        "a_k = Σ c_kh (f_h − r_h),  f_h: the rows of the table, r_h: the same at the reference",
         f"T = (camera − {origin:.3f} °C) / {SPAN_K:g} K, its own temperature",
         f"air(τ) = (air near the camera, through a first-order lag τ, − {air:.3f} °C) / {SPAN_K:g} K",
-        "power(τ) = the supply (0 or 1) through such a lag − 1;  camera(τ): T through such a lag",
-        "play(r) = T through a dead zone of radius r;  I, J in px, integers are pixel centres",
+        "camera(τ) = T through such a lag",
+        *(["power(τ) = the supply (0 or 1) through such a lag − 1"] if Kind.POWER_LAG in kinds else []),
+        "play(r) = T through a dead zone of ± r",
+        "at switching on a camera as cold as the air, lags and plays are at the temperatures of that instant",
+        "I, J in px, integers are pixel centres",
     )
     sigma = np.sqrt(np.diagonal(model.coefficient_covariance, axis1=1, axis2=2))
-    heads = tuple(f"{name}, px" for name in _MOTIONS)
-    return FormulaNumbers(lines, heads, tuple(_feature(term) for term in model.terms), model.coefficients.T, sigma.T)
+    return FormulaNumbers(
+        lines,
+        tuple(f"{name}, px" for name in _MOTIONS),
+        tuple(_feature(term) for term in model.terms),
+        model.coefficients.T,
+        sigma.T,
+        tuple(model.reference_features.tolist()),
+    )
 
 
 def _feature(term: Term) -> str:

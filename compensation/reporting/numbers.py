@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
@@ -138,13 +139,15 @@ class UnrepeatedNumbers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FormulaNumbers:
-    """lines: the formula. coefficients_px, sigma_px (H, K): a row for each of `terms`, a column for each of `heads`."""
+    """lines: the formula. coefficients_px, sigma_px (H, K): a row for each of `terms`, a column for each of `heads`.
+    reference: value of each term at the reference, to be subtracted; empty where nothing is."""
 
     lines: tuple[str, ...]
     heads: tuple[str, ...]
     terms: tuple[str, ...]
     coefficients_px: Float
     sigma_px: Float
+    reference: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +223,13 @@ def significant(value: float, digits: int) -> str:
     rounded, exponent = f"{value:.{digits - 1}e}".split("e")
     places = max(digits - 1 - int(exponent), 0)
     return f"{float(f'{rounded}e{exponent}'):.{places}f}".replace("-", "−")
+
+
+def typeset(text: str) -> str:
+    """A form's name with signs and powers as they are printed."""
+    for plain, printed in (("T^2", "T²"), ("homography x ", "homography × "), ("-", "−")):
+        text = text.replace(plain, printed)
+    return re.sub(r"P\^(\d)", lambda found: "P" + "⁰¹²³⁴⁵⁶⁷⁸⁹"[int(found[1])], text)
 
 
 def compact(value: float, u: float) -> str:

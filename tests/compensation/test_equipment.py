@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from compensation.reporting.equipment import equipment_of
+from foundation.items import Event
 
 
 @pytest.mark.parametrize(
@@ -23,5 +24,30 @@ from compensation.reporting.equipment import equipment_of
 )
 def test_a_sensor_stands_with_its_certificate_and_uncertainty(sensor: str, text: str) -> None:
     config = f"thermometers: {{air: {sensor}, laboratory: {{channel: 4}}}}"
-    session: Any = SimpleNamespace(frame_metas=[], attachment={"config.yaml": config}.get)
+    session: Any = SimpleNamespace(
+        frame_metas=[], camera="camera", events=list[Any], attachment={"config.yaml": config}.get
+    )
     assert ("Thermometer channels", f"{text}, laboratory") in equipment_of(session)
+
+
+def test_devices_stand_with_what_they_said_of_themselves_and_other_cameras_do_not() -> None:
+    cameras = [
+        identity("camera", "Basler", "a2A", "40001", lens="25 mm"),
+        identity("left", "Basler", "a2A", "7", lens=""),
+    ]
+    events = [
+        *cameras,
+        identity("relays", "Waveshare", "Relay (8)", ""),
+        identity("relays", "Waveshare", "Relay (16)", ""),
+    ]
+    session: Any = SimpleNamespace(frame_metas=[], camera="camera", events=lambda: events, attachment={}.get)
+    assert equipment_of(session) == [
+        ("Camera", "Basler a2A, serial number 40001, version 1"),
+        ("Lens in the stand's file", "25 mm"),
+        ("Device relays", "Waveshare Relay (16), version 1"),
+    ]
+
+
+def identity(device: str, vendor: str, model: str, serial: str, **more: str) -> Event:
+    data = {"device": device, "vendor": vendor, "model": model, "serial_number": serial, "version": "1", **more}
+    return Event(0, "info", "device_identity", "", data)

@@ -17,6 +17,7 @@ from compensation.budget.geometry import StandTemperatures
 from compensation.drift.evaluation import Evaluation, evaluate
 from compensation.drift.paper_fit import fit_paper
 from compensation.drift.paper_model import PaperModel
+from compensation.drift.terms import Origin, features
 from compensation.history.states import States
 from compensation.observations import Observations
 from compensation.reporting.compensation_section import uncertainty_section
@@ -148,15 +149,15 @@ def test_it_says_what_was_found_and_what_was_left_out(page: str, analysed: Analy
 
 
 def test_the_table_of_choice_has_every_degree_and_the_one_in_use_is_bold(page: str, analysed: Analysed):
-    rows = re.findall(r"<tr( class=chosen)?><td>paper: P\^(\d)</td><td>(\d+)</td>", page)
+    rows = re.findall(r"<tr( class=chosen)?><td>paper: P([¹²³⁴⁵])</td><td>(\d+)</td>", page)
     assert [(degree, terms) for _, degree, terms in rows] == [
-        ("1", "8"),
-        ("2", "20"),
-        ("3", "40"),
-        ("4", "70"),
-        ("5", "112"),
+        ("¹", "8"),
+        ("²", "20"),
+        ("³", "40"),
+        ("⁴", "70"),
+        ("⁵", "112"),
     ]
-    assert [degree for chosen, degree, _ in rows if chosen] == [str(analysed[1].degree)]
+    assert [degree for chosen, degree, _ in rows if chosen] == ["⁰¹²³⁴⁵"[analysed[1].degree]]
 
 
 def test_page_and_file_have_the_numbers_of_the_evaluation(page: str, written: Path, analysed: Analysed):
@@ -314,7 +315,8 @@ def test_the_formula_of_the_thermal_form_is_its_homography():
     model = thermal()
     formula = formula_of(model)
     states = States.from_rows(model.memory, np.full((1, 4 + 3 * 2 + 2), 30.0))
-    amounts = model._features(states, 1) @ formula.coefficients_px
+    origin = Origin(model.facts.reference_degC, model.reference_ambient_degC)
+    amounts = (features(states, model.terms, origin) - np.array(formula.reference)) @ formula.coefficients_px
     a = amounts[0]
     place = np.array([[200.0, 100.0]])
     width, height = model.facts.image_size
@@ -338,6 +340,11 @@ def test_it_has_layouts_for_paper_phones_and_dark_screens_and_says_what_nobody_s
     for rule in ("prefers-color-scheme: dark", "max-width: 40rem", "@media print", "white-space: pre-wrap"):
         assert rule in page
     assert "<td>Lens</td><td>not stated</td>" in page
+
+
+def test_what_turns_light_on_dark_screens_is_drawn_as_the_rules_expect(page: str):
+    for found in (r'<g id="[a-z-]+text_1"', 'style="fill: #ffffff', 'style="stroke: #000000', "#e6e6e6", "#ececec"):
+        assert re.search(found, page), found
 
 
 def test_the_residuals_have_a_scale_of_their_own():

@@ -7,12 +7,12 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import StrMethodFormatter
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from compensation.drift.evaluation import Evaluation, improvement_percent
 from compensation.observations import Float, Observations
 from compensation.reporting.drawing.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
-from compensation.reporting.drawing.path_figures import Paths, trajectories
+from compensation.reporting.drawing.path_figures import ON_PALE, PALE, Paths, temperature_colours, trajectories
 from compensation.reporting.numbers import percent
 from compensation.reporting.tracks import thinned
 
@@ -50,6 +50,8 @@ def measured_against_model(evaluation: Evaluation) -> Figure:
             both = np.concatenate([said[:, index], measured[:, index]])
             ends = [float(both.min()), float(both.max())]
             axes.plot(ends, ends, color="black", linewidth=0.8, label="measured = model")
+            for scale in (axes.xaxis, axes.yaxis):
+                scale.set_major_locator(MaxNLocator(5))
             _dots(axes, said[drawn, index], measured[drawn, index], colour, "marker centres")
             axes.set_xlabel(f"drift along {name}, model (px)")
             axes.set_aspect("equal", adjustable="box")
@@ -73,17 +75,24 @@ def residual_map(observations: Observations, evaluation: Evaluation) -> Figure:
         figure, (axes,) = new_figure(FULL_WIDTH_IN, 5.4, 1, 1)
         at, arrows = np.stack(mean[:2], axis=1), scale * np.stack(mean[2:], axis=1)
         drawn = axes.quiver(
-            *at.T, *arrows.T, groups[:, 0], angles="xy", scale_units="xy", scale=1, width=0.0013, cmap="viridis"
+            *at.T,
+            *arrows.T,
+            groups[:, 0],
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            width=0.002,
+            cmap=temperature_colours(),
         )
         drawn.set_rasterized(True)
         axes.set(xlabel="column I (px)", ylabel="row J (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
         axes.set_aspect("equal")
         axes.grid(visible=False)
+        axes.set_facecolor(PALE)
         x, y = 0.03 * width, 0.965 * height
-        axes.plot([x, x + scale * bar_px], [y, y], color="black", linewidth=2, solid_capstyle="butt")
-        axes.text(
-            x + scale * bar_px + 0.01 * width, y, f"{1e3 * bar_px:g} mpx, {scale:,.0f} times", va="center", fontsize=8
-        )
+        axes.plot([x, x + scale * bar_px], [y, y], color=ON_PALE, linewidth=2, solid_capstyle="butt")
+        text = f"{1e3 * bar_px:g} mpx, {scale:,.0f} times"
+        axes.text(x + scale * bar_px + 0.01 * width, y, text, va="center", fontsize=8, color=ON_PALE)
         figure.colorbar(drawn, ax=axes, label="chamber temperature (°C)", shrink=0.85, pad=0.02)
     return figure
 

@@ -20,7 +20,9 @@ from compensation.reporting.tracks import thinned
 EXAGGERATION = 100
 _PATH_POINTS = 600
 _SAME_VIEW_PX = 5.0
-_PALE = {"boxstyle": "square,pad=0.15", "facecolor": "#ececec", "edgecolor": "none", "alpha": 0.8}
+PALE, ON_PALE = "#ececec", "#111111"
+"""The ground of pictures, and ink on it: both stay as they are where a page is dark."""
+_BOX = {"boxstyle": "square,pad=0.15", "facecolor": PALE, "edgecolor": "none", "alpha": 0.8}
 _GREY_STEP = 8
 """A coarser picture has no noise to store."""
 
@@ -54,7 +56,7 @@ def trajectories(observations: Observations, panels: Sequence[Paths]) -> Figure:
             spare.remove()
         label = "camera temperature (°C)"
         figure.colorbar(
-            ScalarMappable(norm, _temperature_colours()), ax=axes[: len(panels)], label=label, shrink=0.85, pad=0.02
+            ScalarMappable(norm, temperature_colours()), ax=axes[: len(panels)], label=label, shrink=0.85, pad=0.02
         )
     return figure
 
@@ -67,11 +69,11 @@ def _paths(axes: Axes, panel: Paths, norm: Normalize) -> None:
     if panel.title:
         axes.set_title(panel.title, fontsize=9, loc="left")
     axes.scatter(
-        *path[good].T, c=colour[good], s=5, cmap=_temperature_colours(), norm=norm, linewidths=0, rasterized=True
+        *path[good].T, c=colour[good], s=5, cmap=temperature_colours(), norm=norm, linewidths=0, rasterized=True
     )
 
 
-def _temperature_colours() -> Colormap:
+def temperature_colours() -> Colormap:
     """Plasma without its yellow, which does not show on white."""
     return ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.88, 256)))
 
@@ -100,7 +102,7 @@ def _ground(axes: Axes, observations: Observations, start_px: Float) -> None:
 
 def _outlines(axes: Axes, observations: Observations, start_px: Float) -> None:
     """Discs whose size follows from the distance of their neighbours."""
-    axes.set_facecolor("#ececec")
+    axes.set_facecolor(PALE)
     seen = np.isfinite(start_px).all(axis=1)
     apart_px = np.linalg.norm(start_px[seen][:, None] - start_px[seen], axis=2)
     np.fill_diagonal(apart_px, np.inf)
@@ -123,5 +125,6 @@ def _outlines(axes: Axes, observations: Observations, start_px: Float) -> None:
 def _scale_bar(axes: Axes, width: int, height: int) -> None:
     """What half a pixel of drift looks like."""
     x, y = 0.03 * width, 0.97 * height
-    axes.plot([x, x + 0.5 * EXAGGERATION], [y, y], color="black", linewidth=2, solid_capstyle="butt")
-    axes.text(x + 0.5 * EXAGGERATION + 0.01 * width, y, "0.5 px of drift", va="center", fontsize=8, bbox=_PALE)
+    axes.plot([x, x + 0.5 * EXAGGERATION], [y, y], color=ON_PALE, linewidth=2, solid_capstyle="butt")
+    at_px = x + 0.5 * EXAGGERATION + 0.01 * width
+    axes.text(at_px, y, "0.5 px of drift", va="center", fontsize=8, color=ON_PALE, bbox=_BOX)
