@@ -45,15 +45,18 @@ class ThermalState:
     power at the part of its self-heating that the camera shows. Unless the camera is as cold as the air when it is
     first seen, or when it is switched on after it was unpowered until then, that is a guess, which is forgotten after
     about three of the time constants. camera_degC, air_degC: the last ones.
-    ambient_lag, power_lag, camera_lag: the 10 min lag, then one for each of taus_s. plays: one for each of plays_K.
+    ambient_lag, power_lag, camera_lag: the 10 min lag, then one for each of taus_s. plays: one for each of plays_K,
+    then one for each of part_plays.
     settled_s: how long ago the state was a guess. on_s: since the camera was switched on. begun: False in a gap.
     """
 
-    def __init__(self, taus_s, plays_K, self_heating_K):
+    def __init__(self, taus_s, plays_K, self_heating_K, part_plays=()):
         """taus_s: time constants, s. plays_K: radii. self_heating_K: over the air of a camera that has been on for
-        long."""
+        long. part_plays: (time constant of taus_s, share, radius) of parts between air and camera, which follow both
+        late and have that share (0..1) of the camera's excess."""
         self._taus_s = np.array([RATE_TAU_S, *taus_s])
-        self._radii_K = [float(radius_K) for radius_K in plays_K]
+        self._radii_K = [float(radius_K) for radius_K in (*plays_K, *(part[2] for part in part_plays))]
+        self._parts = [(1 + list(taus_s).index(tau_s), float(share)) for tau_s, share, _ in part_plays]
         self._self_heating_K = self_heating_K
         self._dt_s = self._gained = math.nan
         self.begun = self._unseen = False
@@ -103,10 +106,9 @@ class ThermalState:
         self._ambient = _followed(self._ambient, ambient_degC, self._gained)
         self._power = _followed(self._power, power_on, self._gained)
         self._camera = _followed(self._camera, (before_degC + self.camera_degC) / 2, self._gained)
-        now_degC = self.camera_degC
         self._plays = [
-            min(max(play, now_degC - radius_K), now_degC + radius_K)
-            for play, radius_K in zip(self._plays, self._radii_K, strict=True)
+            min(max(play, push_degC - radius_K), push_degC + radius_K)
+            for play, push_degC, radius_K in zip(self._plays, self._pushes(), self._radii_K, strict=True)
         ]
         if self._unseen and not math.isnan(camera_degC):
             self._unseen = False
@@ -131,7 +133,13 @@ class ThermalState:
         self._ambient, self._power, self._camera = (
             [float(at)] * len(self._taus_s) for at in (ambient_degC, warmed, self.camera_degC)
         )
-        self._plays = [self.camera_degC] * len(self._radii_K)
+        self._plays = self._pushes()
+
+    def _pushes(self):
+        """What moves each play: the camera, or a part."""
+        ambient, camera = self._ambient, self._camera
+        parts = [ambient[at] + share * (camera[at] - ambient[at]) for at, share in self._parts]
+        return [self.camera_degC] * (len(self._radii_K) - len(parts)) + parts
 
 
 def _followed(lags, value, gained):
@@ -143,13 +151,16 @@ class Drift:
 
     def __init__(self, model):
         """model: what the JSON file holds."""
-        if model.get("format") != "thermostand drift runtime" or model.get("version") != 1:
+        if model.get("format") != "thermostand drift runtime" or model.get("version") not in (1, 2):
             raise ValueError("not a drift runtime model of this version")
         self._model = model
         self._coefficients = np.array(model["coefficients_px"])
         self._hull_px = np.array(model["hull_px"])
         self._state = ThermalState(
-            model.get("taus_s", []), model.get("plays_K", []), model.get("self_heating_K", math.nan)
+            model.get("taus_s", []),
+            model.get("plays_K", []),
+            model.get("self_heating_K", math.nan),
+            model.get("part_plays", []),
         )
         self._camera_degC = math.nan
 
@@ -250,9 +261,14 @@ class Drift:
         """The terms of the thermal state."""
         camera_degC, air_degC = self._model["reference_degC"], self._model["reference_ambient_degC"]
         taus_s, radii_K = self._model["taus_s"], self._model["plays_K"]
+        parts = [tuple(part) for part in self._model.get("part_plays", [])]
         state, own = self._state, (self._state.camera_degC - camera_degC) / SPAN_K
         values = []
-        for kind, parameter in self._model["terms"]:
+        for kind, parameter, *of_part in self._model["terms"]:
+            if of_part:
+                place_degC = state.plays[len(radii_K) + parts.index((*of_part, parameter))]
+                values.append((place_degC - air_degC - of_part[1] * (camera_degC - air_degC)) / SPAN_K)
+                continue
             at = 1 + taus_s.index(parameter) if parameter in taus_s else 0
             values.append(
                 {

@@ -79,7 +79,7 @@ def _constants(model: Mapping[str, Any]) -> Iterator[str]:
     thermal = model["form"] == "thermal"
     terms, coefficients, degree = _thermal(model) if thermal else _paper(model)
     width, height = model["image_size_px"]
-    taus_s, plays_K = model.get("taus_s", ()), model.get("plays_K", ())
+    taus_s, plays_K, parts = model.get("taus_s", ()), model.get("plays_K", ()), _parts(model)
     yield from _definitions(
         THERMAL=int(thermal),
         WIDTH=width,
@@ -88,7 +88,8 @@ def _constants(model: Mapping[str, Any]) -> Iterator[str]:
         FIELD=coefficients.shape[1],
         TERMS=len(terms),
         LAGS=1 + len(taus_s),
-        PLAYS=len(plays_K),
+        PLAYS=len(plays_K) + len(parts),
+        PARTS=len(parts),
         SIDES=len(model["hull_px"]),
         STEP_PX=drift_runtime.LATTICE_PX,
         CELLS_X=-(-width // drift_runtime.LATTICE_PX),
@@ -111,7 +112,11 @@ def _constants(model: Mapping[str, Any]) -> Iterator[str]:
     yield "};"
     yield _table("drift_coefficients[2][DRIFT_FIELD][DRIFT_TERMS]", coefficients)
     yield _table("drift_taus_s[DRIFT_LAGS]", np.array([drift_runtime.RATE_TAU_S, *taus_s]))
-    yield _table("drift_plays_K[DRIFT_PLAYS + 1]", np.array([*plays_K, 0.0]))
+    yield _table("drift_plays_K[DRIFT_PLAYS + 1]", np.array([*plays_K, *(radius_K for _, _, radius_K in parts), 0.0]))
+    yield "static const struct { int lag; double share; } drift_parts[DRIFT_PARTS + 1] = {"
+    for tau_s, share, _ in parts:
+        yield f"    {{ {1 + list(taus_s).index(tau_s)}, {_number(share)} }},"
+    yield "    { 0, 0.0 }\n};"
     yield _table("drift_hull[DRIFT_SIDES][4]", _sides(np.array(model["hull_px"])))
     yield from _ranges(model, thermal=thermal)
 
@@ -134,14 +139,19 @@ def _definitions(**values: float) -> Iterator[str]:
 
 def _thermal(model: Mapping[str, Any]) -> tuple[list[_CTerm], Float, int]:
     """Coefficients (2, 6, H) of 1, x, x^2, y, x y, y^2: the eight motions of drift_runtime."""
-    taus_s, plays_K = list(model["taus_s"]), list(model["plays_K"])
+    taus_s, plays_K, parts = list(model["taus_s"]), list(model["plays_K"]), _parts(model)
     camera, air = model["reference_degC"], model["reference_ambient_degC"]
     span = drift_runtime.SPAN_K
     terms: list[_CTerm] = []
-    for (kind, parameter), reference in zip(model["terms"], model["reference_features"], strict=True):
+    for (kind, parameter, *of_part), reference in zip(model["terms"], model["reference_features"], strict=True):
         base = kind.removesuffix(" squared").removesuffix(" cubed")
         at = 1 + taus_s.index(parameter) if parameter in taus_s else 0
         at = plays_K.index(parameter) if base == "play" else at
+        if of_part:
+            tau_s, share = of_part
+            at = len(plays_K) + parts.index((tau_s, share, parameter))
+            terms.append(_CTerm("play", at, 1, air + share * (camera - air), span, reference))
+            continue
         origin = {"constant": 0.0, "ambient lag": air, "power lag": 1.0}.get(base, camera)
         power = 0 if base == "constant" else power_of(Kind(kind))
         terms.append(_CTerm(base, at, power, origin, 1.0 if base == "power lag" else span, reference))
@@ -149,6 +159,10 @@ def _thermal(model: Mapping[str, Any]) -> tuple[list[_CTerm], Float, int]:
     zero = np.zeros_like(right)
     along_i, along_j = [right, xx, bend_x, xy, bend_y, zero], [down, yx, zero, yy, bend_x, bend_y]
     return terms, np.array([along_i, along_j]), 2
+
+
+def _parts(model: Mapping[str, Any]) -> list[tuple[float, float, float]]:
+    return [(float(tau_s), float(share), float(radius_K)) for tau_s, share, radius_K in model.get("part_plays", ())]
 
 
 def _paper(model: Mapping[str, Any]) -> tuple[list[_CTerm], Float, int]:

@@ -117,6 +117,15 @@ static inline void drift_init(drift_state *state) {
     drift_update(state);
 }
 
+/* What moves a play: the camera, or a part that follows air and camera late. */
+static inline double drift_push(const drift_state *state, int play) {
+    const int part = play - (DRIFT_PLAYS - DRIFT_PARTS);
+    double air_degC;
+    if (part < 0) return state->camera_degC;
+    air_degC = state->ambient_lag[drift_parts[part].lag];
+    return air_degC + drift_parts[part].share * (state->camera_lag[drift_parts[part].lag] - air_degC);
+}
+
 /* In equilibrium, with the part of its self-heating that the camera shows: a guess, unless it is as cold as the air
  * now, or, without power until then, when it is switched on. */
 static inline void drift_begin(drift_state *state, double ambient_degC, double power_on, double camera_degC) {
@@ -135,7 +144,7 @@ static inline void drift_begin(drift_state *state, double ambient_degC, double p
         state->power_lag[k] = cold ? 0.0 : drift_clip(excess_K / DRIFT_SELF_HEATING_K, 0.0, 1.0);
         state->camera_lag[k] = state->camera_degC;
     }
-    for (k = 0; k <= DRIFT_PLAYS; ++k) state->plays[k] = state->camera_degC;
+    for (k = 0; k <= DRIFT_PLAYS; ++k) state->plays[k] = drift_push(state, k);
 }
 
 /* dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them powered; at
@@ -164,8 +173,8 @@ static inline unsigned drift_advance(drift_state *state, double dt_s, double amb
         state->camera_lag[k] += (driver_degC - state->camera_lag[k]) * gained;
     }
     for (k = 0; k < DRIFT_PLAYS; ++k) {
-        state->plays[k] = drift_clip(state->plays[k], state->camera_degC - drift_plays_K[k],
-                                     state->camera_degC + drift_plays_K[k]);
+        const double push_degC = drift_push(state, k);
+        state->plays[k] = drift_clip(state->plays[k], push_degC - drift_plays_K[k], push_degC + drift_plays_K[k]);
     }
     if (state->unseen && drift_is_temperature(camera_degC)) {
         state->unseen = 0;

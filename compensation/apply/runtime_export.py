@@ -10,6 +10,7 @@ from pathlib import Path
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.polynomial import exponents
+from compensation.drift.terms import Kind, Term
 from compensation.drift.thermal_model import ThermalModel
 from foundation.files import make_folder, write_whole
 
@@ -35,7 +36,7 @@ def runtime_model(model: DriftModel) -> dict[str, object]:
     facts = model.facts
     common: dict[str, object] = {
         "format": "thermostand drift runtime",
-        "version": 1,
+        "version": 2,
         "form": model.form,
         "camera_serial": facts.camera_serial,
         "software_version": facts.software_version,
@@ -55,12 +56,19 @@ def runtime_model(model: DriftModel) -> dict[str, object]:
     return {**common, **of_form}
 
 
+def _term(term: Term) -> list[str | float]:
+    """Its kind and parameter, of a part's play also the part's time constant and share."""
+    of_part = [term.tau_s, term.share] if term.kind is Kind.PART_PLAY else []
+    return [str(term.kind), term.parameter, *of_part]
+
+
 def _thermal(model: ThermalModel) -> dict[str, object]:
     memory, valid = model.memory, model.valid
     return {
-        "terms": [[str(term.kind), term.parameter] for term in model.terms],
+        "terms": [_term(term) for term in model.terms],
         "taus_s": memory.taus_s,
         "plays_K": memory.plays_K,
+        "part_plays": memory.part_plays,
         "self_heating_K": memory.self_heating_K,
         "reference_ambient_degC": model.reference_ambient_degC,
         "reference_features": model.reference_features.tolist(),

@@ -104,17 +104,32 @@ def at_rest(around: Surroundings, set_points_degC: Float, memory: Memory) -> Sit
     camera = around.camera_degC(air, lags)
     unknown = States.at_degC(camera, len(air), memory)
     taus, count = len(memory.taus_s), len(air)
+    ambient_lag, camera_lag = (np.repeat(at[:, None], taus, axis=1) for at in (air, camera))
     states = replace(
         unknown,
-        ambient_lag_degC=np.repeat(air[:, None], taus, axis=1),
+        ambient_lag_degC=ambient_lag,
         power_lag=np.ones((count, taus)),
-        camera_lag_degC=np.repeat(camera[:, None], taus, axis=1),
-        play_degC=camera[:, None] - np.array(memory.plays_K)[None, :],
+        camera_lag_degC=camera_lag,
+        play_degC=_pushes(memory, camera, ambient_lag, camera_lag) - _radii_K(memory),
         rate_K_per_h=np.zeros(count),
         on_s=np.full(count, np.inf),
         settled_s=np.full(count, np.inf),
     )
     return Situation(air, air, lags, states)
+
+
+def _radii_K(memory: Memory) -> Float:
+    """(P,): of all plays."""
+    return np.array([*memory.plays_K, *(radius_K for _, _, radius_K in memory.part_plays)])
+
+
+def _pushes(memory: Memory, camera_degC: Float, ambient_lag_degC: Float, camera_lag_degC: Float) -> Float:
+    """(S, P): what moves each play, the camera or a part."""
+    lags = [memory.taus_s.index(tau_s) for tau_s, _, _ in memory.part_plays]
+    shares = np.array([share for _, share, _ in memory.part_plays])
+    of_air, of_camera = ambient_lag_degC[:, lags], camera_lag_degC[:, lags]
+    own = np.repeat(camera_degC[:, None], len(memory.plays_K), axis=1)
+    return np.hstack([own, of_air + shares * (of_camera - of_air)])
 
 
 def after(around: Surroundings, situation: Situation, set_points_degC: Float, dwell_s: Float) -> Situation:
@@ -124,7 +139,7 @@ def after(around: Surroundings, situation: Situation, set_points_degC: Float, dw
     target, air, lags = situation.target_degC, situation.air_degC, situation.camera_lags
     camera, ambient_lag, power_lag = before.camera_degC, before.ambient_lag_degC, before.power_lag
     camera_lag, play = before.camera_lag_degC, before.play_degC
-    taus, radii = np.array(before.memory.taus_s), np.array(before.memory.plays_K)
+    taus, radii = np.array(before.memory.taus_s), _radii_K(before.memory)
     for _ in range(int(np.ceil(left_s.max() / STEP_S))):
         dt = np.clip(left_s, 0.0, STEP_S)[:, None]
         left_s -= STEP_S
@@ -139,7 +154,8 @@ def after(around: Surroundings, situation: Situation, set_points_degC: Float, dw
         ambient_lag = ambient_lag + (mean_air - ambient_lag) * gained
         power_lag = power_lag + (1 - power_lag) * gained
         camera_lag = camera_lag + (((camera + before_camera) / 2)[:, None] - camera_lag) * gained
-        play = np.clip(play, camera[:, None] - radii, camera[:, None] + radii)
+        pushes = _pushes(before.memory, camera, ambient_lag, camera_lag)
+        play = np.clip(play, pushes - radii, pushes + radii)
     states = replace(
         before,
         camera_degC=camera,

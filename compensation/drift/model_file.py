@@ -2,14 +2,14 @@
 
 A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form, those
 before version 4 know of no bumps, those before version 5 have correlations between the motions, which are dropped,
-those before version 6 no powers of the air's lags, and those before version 7 claim too little on another night: their
-covariance is also the matrix of leverage.
+those before version 6 no powers of the air's lags, those before version 7 claim too little on another night: their
+covariance is also the matrix of leverage; those before version 8 have no plays of parts.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,7 +30,7 @@ from foundation.documents import Document, load_json
 from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 
 Positive = Annotated[int, Field(gt=0)]
 Rows = tuple[tuple[float, ...], ...]
@@ -40,7 +40,7 @@ class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Literal[2, 3, 4, 5, 6, 7] = SCHEMA_VERSION
+    schema_version: Literal[2, 3, 4, 5, 6, 7, 8] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]
@@ -69,10 +69,12 @@ class PaperFile(_File):
 
 
 class TermFile(Document):
-    """A term; the parameter is a time constant, s, or the radius of a play, K."""
+    """A term; the parameter is a time constant, s, or the radius of a play, K. tau_s, share: of a part's play."""
 
     kind: Kind
     parameter: Annotated[float, Field(ge=0)]
+    tau_s: Annotated[float, Field(ge=0)] = 0.0
+    share: Annotated[float, Field(ge=0, le=1)] = 0.0
 
 
 class ThermalFile(_File):
@@ -165,7 +167,7 @@ def _paper_fields(model: PaperModel) -> dict[str, object]:
 
 def _thermal_fields(model: ThermalModel) -> dict[str, object]:
     return {
-        "terms": [{"kind": term.kind, "parameter": term.parameter} for term in model.terms],
+        "terms": [asdict(term) for term in model.terms],
         "reference_ambient_degC": model.reference_ambient_degC,
         "reference_features": model.reference_features.tolist(),
         "self_heating_K": model.self_heating_K,
@@ -211,7 +213,7 @@ def _thermal(file: ThermalFile) -> ThermalModel:
     covariance, leverage = _blocks(file, count), file.leverage_matrix_px2
     return ThermalModel(
         facts=_facts(file),
-        terms=tuple(Term(term.kind, term.parameter) for term in file.terms),
+        terms=tuple(Term(term.kind, term.parameter, term.tau_s, term.share) for term in file.terms),
         reference_ambient_degC=file.reference_ambient_degC,
         self_heating_K=file.self_heating_K,
         reference_features=_shaped("reference_features", file.reference_features, (count,)),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import product
 
 import numpy as np
 
@@ -21,7 +22,7 @@ _SPAN_K = 20.0
 
 class Kind(StrEnum):
     """What a term is made of. CAMERA_LAG: what follows the camera's own temperature, as a lens does. POWER_LAG,
-    CAMERA_LAG_SQUARE: in older models."""
+    CAMERA_LAG_SQUARE: in older models. PART_PLAY: of a part between air and camera that nobody measures, as a mount."""
 
     CONSTANT = "constant"
     CAMERA = "camera"
@@ -33,14 +34,18 @@ class Kind(StrEnum):
     CAMERA_LAG = "camera lag"
     CAMERA_LAG_SQUARE = "camera lag squared"
     PLAY = "play"
+    PART_PLAY = "part play"
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One feature. parameter: time constant of a lag, s, or radius of a play, K; 0 for the others."""
+    """One feature. parameter: time constant of a lag, s, or radius of a play, K; 0 for the others. tau_s, share: of the
+    part in a part's play, how late it follows and its share of the camera's excess over the air."""
 
     kind: Kind
     parameter: float = 0.0
+    tau_s: float = 0.0
+    share: float = 0.0
 
 
 TAUS_S = tuple(60.0 * minutes for minutes in (4, 8, 15, 27, 50, 100, 210, 450))
@@ -54,6 +59,10 @@ _BENT, _BENT_S = (Kind.AMBIENT_LAG_SQUARE, Kind.AMBIENT_LAG_CUBE), (480.0, 1620.
 
 PLAYS_K = (3.0, 6.0, 10.0, 14.0)
 
+PART_PLAYS = tuple(product((480.0, 1620.0, 3000.0), (0.1, 0.3), (1.0, 2.0, 4.0)))
+"""Time constants, shares and radii. A dead zone in a mount moves the image by where the mount came from, which is no
+play of the chip's temperature: switching on heats the chip by 15 K and the mount by 3."""
+
 TERMS = (
     Term(Kind.CONSTANT),
     Term(Kind.CAMERA),
@@ -61,6 +70,7 @@ TERMS = (
     *(Term(kind, tau_s) for kind in (Kind.AMBIENT_LAG, Kind.CAMERA_LAG) for tau_s in TAUS_S),
     *(Term(kind, tau_s) for kind in _BENT for tau_s in _BENT_S),
     *(Term(Kind.PLAY, radius_K) for radius_K in PLAYS_K),
+    *(Term(Kind.PART_PLAY, radius_K, tau_s, share) for tau_s, share, radius_K in PART_PLAYS),
 )
 """What a camera may be moved by. Its own temperature brings its self-heating with it: with lags of the supply, a
 warm-up in other air is predicted worse. Higher powers follow the air: a camera that is switched on cold is at
@@ -85,8 +95,10 @@ def memory_of(terms: tuple[Term, ...], self_heating_K: float) -> Memory:
     """What the terms need remembered, and one lag of the ambient in any case: its range is part of where a model holds,
     also where a warm-up has shown the camera at every temperature."""
     plays = {term.parameter for term in terms if term.kind is Kind.PLAY}
-    taus = {term.parameter for term in terms if term.kind is not Kind.PLAY and term.parameter > 0} or {_QUICK_S}
-    return Memory(tuple(sorted(taus)), tuple(sorted(plays)), self_heating_K)
+    parts = [(term.tau_s, term.share, term.parameter) for term in terms if term.kind is Kind.PART_PLAY]
+    of_lags = {term.parameter for term in terms if term.kind not in (Kind.PLAY, Kind.PART_PLAY) and term.parameter > 0}
+    taus = of_lags | {tau_s for tau_s, _, _ in parts} or {_QUICK_S}
+    return Memory(tuple(sorted(taus)), tuple(sorted(plays)), self_heating_K, tuple(sorted(parts)))
 
 
 def power_of(kind: Kind) -> int:
@@ -120,6 +132,11 @@ def _feature(states: States, term: Term, origin: Origin) -> Float:
         case Kind.PLAY:
             play = states.play_degC[:, memory.plays_K.index(term.parameter)]
             return (play - origin.camera_degC) / _SPAN_K
+        case Kind.PART_PLAY:
+            part = memory.part_plays.index((term.tau_s, term.share, term.parameter))
+            play = states.play_degC[:, len(memory.plays_K) + part]
+            at_origin = origin.ambient_degC + term.share * (origin.camera_degC - origin.ambient_degC)
+            return (play - at_origin) / _SPAN_K
 
 
 def motions(xy_px: Float, image_size: tuple[int, int]) -> Float:

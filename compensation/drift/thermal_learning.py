@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px
 from compensation.drift.displacements import Displacements
 from compensation.drift.facts import facts_of
-from compensation.drift.terms import MOTIONS, PLAYS_K, TAUS_S, TERMS, Kind, motions
+from compensation.drift.terms import MOTIONS, PART_PLAYS, PLAYS_K, TAUS_S, TERMS, Kind, motions
 from compensation.drift.thermal_fit import Learned, learn
 from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
 from compensation.drift.training import Training, self_heating_K, training
@@ -47,7 +47,7 @@ class _Taught:
 
 def fit_thermal(observations: Observations) -> ThermalModel:
     """The model of the REFERENCE, FIT and WARM_UP frames; SessionError when the sessions cannot support it."""
-    memory = Memory(TAUS_S, PLAYS_K, self_heating_K(observations))
+    memory = Memory(TAUS_S, PLAYS_K, self_heating_K(observations), PART_PLAYS)
     return _model(_taught(training(observations, TERMS, memory)), memory.self_heating_K)
 
 

@@ -158,14 +158,17 @@ def _widened(limits: Pair, least: float = 0.0) -> Pair:
 
 
 def form_name(terms: tuple[Term, ...]) -> str:
-    """`homography x (1, T, T^2), ambient lag 4 to 450 min, plays 3 to 14 K`."""
+    """`homography x (1, T, T^2), ambient lag 4 to 450 min, plays 3 to 14 K, plays of parts 1 to 4 K`."""
     of_camera = {Kind.CONSTANT: "1", Kind.CAMERA: "T", Kind.CAMERA_SQUARE: "T^2"}
+    of_plays = {Kind.PLAY: "plays", Kind.PART_PLAY: "plays of parts"}
     parts = [f"homography x ({', '.join(of_camera[term.kind] for term in terms if term.kind in of_camera)})"]
-    for kind in (kind for kind in Kind if kind not in (*of_camera, Kind.PLAY)):
+    for kind in (kind for kind in Kind if kind not in (*of_camera, *of_plays)):
         taus = [term.parameter / 60 for term in terms if term.kind is kind]
         parts += [f"{kind} {_extent(taus)} min"] if taus else []
-    radii = [term.parameter for term in terms if term.kind is Kind.PLAY]
-    return ", ".join([*parts, *([f"plays {_extent(radii)} K"] if radii else [])])
+    for kind, name in of_plays.items():
+        radii = [term.parameter for term in terms if term.kind is kind]
+        parts += [f"{name} {_extent(radii)} K"] if radii else []
+    return ", ".join(parts)
 
 
 def _extent(values: list[float]) -> str:

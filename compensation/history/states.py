@@ -22,16 +22,24 @@ _SINGLES = 4
 @dataclass(frozen=True, slots=True)
 class Memory:
     """What a model needs remembered: lags of ambient, power and camera temperature with these time constants, plays of
-    the camera's temperature with these radii. self_heating_K: of a camera over the air that has been on for long."""
+    the camera's temperature with these radii. self_heating_K: of a camera over the air that has been on for long.
+    part_plays: time constant (one of taus_s), share and radius of plays of parts that nobody measures, see
+    drift_runtime.ThermalState."""
 
     taus_s: tuple[float, ...] = ()
     plays_K: tuple[float, ...] = ()
     self_heating_K: float = 15.0
+    part_plays: tuple[tuple[float, float, float], ...] = ()
+
+    @property
+    def plays(self) -> int:
+        """How many, those of parts among them."""
+        return len(self.plays_K) + len(self.part_plays)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """A camera's thermal state at F instants; K time constants and P plays as `memory` lists them.
+    """A camera's thermal state at F instants; K time constants and P plays as `memory` lists them, those of parts last.
 
     camera_degC (F,): its own temperature. ambient_lag_degC, power_lag, camera_lag_degC (F, K): of the air near the
     camera, of its supply (0..1), of its own temperature. play_degC (F, P). rate_K_per_h (F,): of the ambient.
@@ -60,7 +68,7 @@ class States:
     def at_degC(cls, camera_degC: float | Float, count: int, memory: Memory | None = None) -> States:
         """Nothing but the camera's temperature is known, one or (F,), at `count` instants."""
         memory = memory or Memory()
-        rows = np.full((count, _SINGLES + 3 * len(memory.taus_s) + len(memory.plays_K)), np.nan)
+        rows = np.full((count, _SINGLES + 3 * len(memory.taus_s) + memory.plays), np.nan)
         rows[:, 0] = camera_degC
         return cls.from_rows(memory, rows)
 
@@ -77,7 +85,7 @@ class States:
 
 def state_of(memory: Memory) -> ThermalState:
     """A camera's thermal state that remembers this, before its first sample."""
-    return ThermalState(memory.taus_s, memory.plays_K, memory.self_heating_K)
+    return ThermalState(memory.taus_s, memory.plays_K, memory.self_heating_K, memory.part_plays)
 
 
 def row_of(state: ThermalState) -> Float:

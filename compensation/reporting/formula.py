@@ -55,6 +55,7 @@ def _thermal(model: ThermalModel) -> FormulaNumbers:
         "camera(τ) = T through such a lag",
         *(["power(τ) = the supply (0 or 1) through such a lag − 1"] if Kind.POWER_LAG in kinds else []),
         "play(r) = T through a dead zone of ± r",
+        "play(r, τ, s): so of air(τ) + s (camera(τ) − air(τ)), a part that nobody measures",
         "at switching on a camera as cold as the air, lags and plays are at the temperatures of that instant",
         "I, J in px, integers are pixel centres",
     )
@@ -82,4 +83,5 @@ def _feature(term: Term) -> str:
         Kind.CAMERA_LAG: f"camera({minutes})",
         Kind.CAMERA_LAG_SQUARE: f"camera({minutes})²",
         Kind.PLAY: f"play({term.parameter:g} K)",
+        Kind.PART_PLAY: f"play({term.parameter:g} K, {term.tau_s / 60:g} min, {term.share:g})",
     }[term.kind]

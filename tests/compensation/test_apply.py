@@ -75,6 +75,8 @@ def thermal(*, warmed: bool = True) -> ThermalModel:
         *(Term(kind, 600.0) for kind in (Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE)),
         Term(Kind.PLAY, 6.0),
         Term(Kind.PLAY, 3.0),
+        Term(Kind.PART_PLAY, 2.0, 3600.0, 0.3),
+        Term(Kind.PART_PLAY, 1.0, 600.0, 0.1),
     )
     rng = np.random.default_rng(7)
     return ThermalModel(

@@ -314,7 +314,7 @@ def test_the_formula_in_the_report_gives_the_model_s_corrections(analysed: Analy
 def test_the_formula_of_the_thermal_form_is_its_homography():
     model = thermal()
     formula = formula_of(model)
-    states = States.from_rows(model.memory, np.full((1, 4 + 3 * 2 + 2), 30.0))
+    states = States.from_rows(model.memory, np.full((1, 4 + 3 * 2 + model.memory.plays), 30.0))
     origin = Origin(model.facts.reference_degC, model.reference_ambient_degC)
     amounts = (features(states, model.terms, origin) - np.array(formula.reference)) @ formula.coefficients_px
     a = amounts[0]

@@ -183,7 +183,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
         np.testing.assert_equal(getattr(loaded.facts, name), getattr(thermal.facts, name), err_msg=name)
     assert loaded.valid.__repr__() == thermal.valid.__repr__()
     data = json.loads((tmp_path / "model.json").read_text())
-    assert (data["form"], data["schema_version"]) == ("thermal", 7)
+    assert (data["form"], data["schema_version"]) == ("thermal", 8)
     older = {name: value for name, value in data.items() if name != "leverage_matrix_px2"}
     (tmp_path / "older.json").write_text(json.dumps({**older, "schema_version": 6}))
     old = load_model(tmp_path / "older.json")

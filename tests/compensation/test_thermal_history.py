@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,6 +48,21 @@ def test_a_lag_follows_a_step_as_the_exponential_does(after_s: int):
     assert found.power_lag[0].tolist() == [1.0, 1.0]
     assert found.play_degC[0, 0] == pytest.approx(52.0)  # 2 K behind 54 degC
     assert found.rate_K_per_h[0] == pytest.approx(6 * 10 * np.exp(-after_s / 600), abs=0.2)
+
+
+def test_a_part_between_air_and_camera_has_plays_of_its_own():
+    """Switched on, the chip is 20 K warmer and the part 0.3 of that; its play is left 2 K behind, and behind 54 degC of
+    the air when all has settled there."""
+    memory = replace(MEMORY, part_plays=((600.0, 0.3, 2.0),))
+    state = ThermalState(memory.taus_s, memory.plays_K, memory.self_heating_K, memory.part_plays)
+    state.advance(10.0, 24.0, 1.0, 24.0)
+    assert state.plays.tolist() == [24.0, 24.0]
+    for _ in range(2000):
+        state.advance(10.0, 24.0, 1.0, 44.0)
+    assert state.plays == pytest.approx([42.0, 28.0], abs=1e-6)
+    for _ in range(2000):
+        state.advance(10.0, 54.0, 1.0, 74.0)
+    assert state.plays == pytest.approx([72.0, 58.0], abs=1e-6)
 
 
 def test_a_warm_start_is_a_guess_and_a_cold_one_is_known():
