@@ -13,9 +13,8 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from recording.writing import notices
-from stand import simulator
 from tests.addresses import WORKER
-from tests.forked import Forks, Laboratories
+from tests.forked import STARTERS, Forks, Programs
 from tests.stock_camera import run_stock_camera
 
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
@@ -93,7 +92,8 @@ def _forked_programs(runtime_folder: Path) -> Iterator[None]:
     """A program that a test starts begins at once."""
     forks = Forks()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulator, "subprocess", Laboratories)
+        for starter in STARTERS:
+            patch.setattr(f"{starter}.subprocess", Programs)
         yield
     forks.close()
 

@@ -1,10 +1,11 @@
 """The programs of the tests are forked from a process that has their modules loaded: a start then does without the
-second of processor time that importing them takes. So are the simulated laboratories that they start themselves. What
-a person starts is a program of its own, which a few tests start as such."""
+second of processor time that importing them takes. So are the simulated laboratories and the helpers that they start
+themselves. What a person starts is a program of its own, which a few tests start as such."""
 
 from __future__ import annotations
 
 import atexit
+import fcntl
 import gc
 import importlib
 import json
@@ -28,11 +29,22 @@ _ENTRIES = {"drivers.sim": "drivers.sim.__main__:main", "stand.cli": "stand.cli:
 """Of what `python -m` starts, what runs it; of other modules it is `main`."""
 _LOADED = {
     "stand.cli": ("stand.commands.run_cli", "stand.commands.serve_cli", "stand.commands.queue_cli"),
+    "recording.writing.disk": ("recording.writing.recorder", "stand.queueing.queue_work"),
+    "stand.serving.preview_process": ("stand.serving.preview", "stand.serving.recorded_drift"),
 }
 """What such a program imports on its way, too."""
+_HELPER = "foundation.helper"
+"""It is given the module whose calls it makes."""
+STARTERS = ("stand.simulator", "foundation.helper")
+"""Modules that start such programs themselves."""
 _AT_THE_START = ("PYTHONPATH", "LD_PRELOAD", "NUMBA_CACHE_DIR", "PYTHONWARNINGS")
 """Who changes one of these gets a program of its own: they count while modules are loaded."""
+OWN_HELPERS = "OWN_HELPERS"
+"""Where this is in the environment, helpers are programs of their own, children of who starts them."""
 _MESSAGE_BYTES = 200_000
+_MOST_ENDS = 3 + 16
+_APART = 4096
+"""From this number on are the files that a program is given, until it has closed all others."""
 _address = ""
 """Where the process that forks answers."""
 
@@ -41,7 +53,8 @@ def popen(command: Sequence[Any], **options: Any) -> subprocess.Popen[Any]:
     """As subprocess.Popen, for `python -m module arguments`."""
     words, env = [os.fspath(word) for word in command], options.get("env") or os.environ
     is_alike = all(env.get(name) == os.environ.get(name) for name in _AT_THE_START)
-    if not _address or not is_alike or words[:2] != [sys.executable, "-m"]:
+    is_apart = OWN_HELPERS in env and words[2:3] == [_HELPER]
+    if not _address or not is_alike or is_apart or words[:2] != [sys.executable, "-m"]:
         return subprocess.Popen(words, **options)
     return _Forked(words, **options)
 
@@ -59,10 +72,10 @@ def run(command: Sequence[Any], timeout: float | None = None, **options: Any) ->
     return subprocess.CompletedProcess(command, process.returncode, out, err)
 
 
-class Laboratories:
-    """In the place of the module `subprocess` where simulators are started."""
+class Programs:
+    """In the place of the module `subprocess` where simulators and helpers are started."""
 
-    PIPE, TimeoutExpired = subprocess.PIPE, subprocess.TimeoutExpired
+    PIPE, DEVNULL, TimeoutExpired = subprocess.PIPE, subprocess.DEVNULL, subprocess.TimeoutExpired
     Popen, run = staticmethod(popen), staticmethod(subprocess.run)
 
 
@@ -77,6 +90,7 @@ class _Forked(subprocess.Popen[Any]):
             "processors": sorted(os.sched_getaffinity(0)),
             "asker": os.getpid(),
             "is_leader": bool(options.get("start_new_session")),
+            "files": list(options.get("pass_fds", ())),
         }
         super().__init__(command, **options)
 
@@ -89,7 +103,7 @@ class _Forked(subprocess.Popen[Any]):
         given = [usual if end < 0 else end for usual, end in enumerate((stdin, stdout, stderr))]
         self._line = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._line.connect(_address)
-        socket.send_fds(self._line, [json.dumps(self._wanted).encode()], given)
+        socket.send_fds(self._line, [json.dumps(self._wanted).encode()], [*given, *self._wanted["files"]])
         self.pid = int(self._line.recv(64))
         self._child_created = True
         kept = {-1, self_in, self_out, self_err}
@@ -102,6 +116,12 @@ class _Forked(subprocess.Popen[Any]):
         status = int(self._line.recv(64) or signal.SIGKILL)
         self._line.close()
         return self.pid, status
+
+    def __del__(self, *_: Any, **__: Any) -> None:
+        """Of a program that is not waited for any more, too."""
+        if hasattr(self, "_line"):
+            self._line.close()
+        super().__del__()  # type: ignore[misc]
 
     def _internal_poll(self, _deadstate: Any = None, **_: Any) -> int | None:
         if self.returncode is None and self._waitpid_lock.acquire(False):  # type: ignore[attr-defined]
@@ -169,14 +189,15 @@ class _Server:
 
     def _fork(self) -> dict[str, Any] | None:
         line, _ = self._listener.accept()
-        message, ends, _, _ = socket.recv_fds(line, _MESSAGE_BYTES, 3)
+        message, ends, _, _ = socket.recv_fds(line, _MESSAGE_BYTES, _MOST_ENDS)
         wanted: dict[str, Any] = json.loads(message)
         with suppress(Exception):  # the program itself says why it cannot begin
-            _load(wanted["words"][0])
+            _load(*wanted["words"][:2])
         pid = os.fork()
         if not pid:
-            for number, end in enumerate(ends):
-                os.dup2(end, number)
+            for each in (self._listener, line, *self._lines.values()):
+                each.detach()  # or their numbers, which may be those of the program's files, are closed with them
+            _hold([0, 1, 2, *wanted["files"]], ends)
             return wanted
         for end in ends:
             os.close(end)
@@ -191,10 +212,20 @@ class _Server:
                     line.send(str(ended[1]).encode())
 
 
-def _load(module: str) -> Callable[[], Any]:
-    """What runs the program."""
+def _hold(numbers: Sequence[int], ends: Sequence[int]) -> None:
+    """Have these files under these numbers, and no others."""
+    apart = [fcntl.fcntl(end, fcntl.F_DUPFD, _APART) for end in ends]
+    os.closerange(0, _APART)
+    for number, end in zip(numbers, apart, strict=True):
+        os.dup2(end, number)
+        os.close(end)
+
+
+def _load(module: str, argument: str = "") -> Callable[[], Any]:
+    """What runs the program, whose first argument that is."""
     home, _, entry = _ENTRIES.get(module, f"{module}:main").partition(":")
-    for each in (*_LOADED.get(module, ()), home):
+    made = argument if module == _HELPER else module
+    for each in (*_LOADED.get(made, ()), made if module == _HELPER else home, home):
         if each not in sys.modules:
             importlib.import_module(each)
             gc.freeze()  # a program that collects garbage would copy all memory that it shares with the others
@@ -218,18 +249,16 @@ def _become(wanted: Mapping[str, Any]) -> Callable[[], Any]:
     sys.stdin, sys.stdout = os.fdopen(0, closefd=False), os.fdopen(1, "w", closefd=False)
     sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
     module, *arguments = wanted["words"]
-    runs = _load(module)
+    runs = _load(module, *arguments[:1])
     sys.argv = [str(sys.modules[runs.__module__].__file__), *arguments]
-    if simulator := sys.modules.get("stand.simulator"):
-        setattr(simulator, "subprocess", Laboratories)  # noqa: B010
+    for starter in STARTERS:
+        if starter in sys.modules:
+            setattr(sys.modules[starter], "subprocess", Programs)  # noqa: B010
     return runs
 
 
 def _serve(listener: socket.socket) -> Callable[[], Any]:
-    server = _Server(listener)
-    wanted = server.wanted()
-    os.closerange(3, 4096)
-    return _become(wanted)
+    return _become(_Server(listener).wanted())
 
 
 def _leave(runs: Callable[[], Any]) -> NoReturn:

@@ -16,6 +16,7 @@ from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.running.order import Order
 from stand.simulator import Simulator, laboratory_of
 from tests.addresses import move_to_free
+from tests.forked import OWN_HELPERS
 from tests.sections import change
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
@@ -110,6 +111,12 @@ def order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Orde
         return Order(config, load_document(recipe_file, Recipe), text, recipe, target, at_configured_addresses=True)
 
     return build
+
+
+@pytest.fixture
+def own_helpers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A daemon's helpers are its children, to be found by their command."""
+    monkeypatch.setenv(OWN_HELPERS, "1")
 
 
 @pytest.fixture

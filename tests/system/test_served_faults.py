@@ -62,6 +62,7 @@ def begin(tmp_path: Path, laboratory: Path) -> Iterator[Callable[[], Served]]:
         each.process.communicate()
 
 
+@pytest.mark.usefixtures("own_helpers")
 def test_whichever_disk_process_is_killed_no_heat_goes_on_without_what_it_did(begin: Callable[[], Served]):
     """That of the record between runs is replaced, and an operator may clear and heat again. Without its own the daemon
     knows neither its queue nor keeps the compressor's rest: it ends, and the next one has both."""

@@ -102,6 +102,7 @@ async def says(path: Path, text: str) -> None:
             await asyncio.sleep(0.05)
 
 
+@pytest.mark.usefixtures("own_helpers")
 async def test_a_disk_that_hangs_withdraws_the_heat_until_it_is_back_and_keeps_nobody_from_leaving(
     disk: Path, tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
@@ -145,6 +146,7 @@ def disk_process() -> int:
     return pid
 
 
+@pytest.mark.usefixtures("own_helpers")
 async def test_a_run_whose_disk_process_was_killed_ends_safe_with_all_that_was_acknowledged(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
