@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,9 +181,8 @@ def nodes_degC(camera: Camera, air_degC: Float, powered: Float) -> Float:
 
 def _first_order(gained: Float, keep: float, begin: float) -> Float:
     """s = keep s + gained, for each of the steps."""
-    from scipy.signal import lfilter  # which takes a second, also where nothing is drawn
-
-    return np.asarray(lfilter([1.0], [1.0, -keep], gained, zi=[keep * begin])[0])
+    states = accumulate(gained.tolist(), lambda state, gain: gain + keep * state, initial=begin)
+    return np.array(list(states)[1:])
 
 
 def settled_degC(camera: Camera, air_degC: float) -> Float:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.signal import TransferFunction, lsim
 
 from drivers.devices.regulators import pid
 from drivers.devices.regulators.pid import Law
@@ -28,6 +27,8 @@ PLAIN = Law(
 def test_a_small_step_of_the_set_point_follows_the_continuous_law(b: float, c: float, derivative_s: float):
     """G = 0.5 K/% / (60 s + 1) under u = K (b r - y + (r - y) / (Ti s) + Td s (c r - y) / (1 + Td s / N)): the closed
     loop's step response by lsim. Sampled at Ti / 500, so that the discretization does not count."""
+    from scipy.signal import TransferFunction, lsim  # a second of processor time, in each worker that collects it
+
     K, Ti, N, h_s = 10.0, 100.0, 8.0, 0.2
     law = PLAIN.model_copy(
         update={"derivative_s": derivative_s, "set_point_weight": b, "derivative_set_point_weight": c}
