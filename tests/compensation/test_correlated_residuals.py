@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from markers.band import NARROW_SIGMA, WIDE_SIGMA
 from markers.detection import Detection, detect
 from markers.sandwich import variance_growth, variance_ratio
+from tests.nightly import by_night
 
 from .rendered import Float, render, true_centres_px
 from .spoiled import (
@@ -49,12 +50,12 @@ def errors_px(picture: Picture) -> tuple[Float, Float, list[Detection]]:
     "picture",
     [
         noise_alone,
-        as_jpeg(95),
+        by_night(as_jpeg(95)),
         as_jpeg(90),
-        as_jpeg(80),
-        moved_while_exposed(2),
+        by_night(as_jpeg(80)),
+        by_night(moved_while_exposed(2)),
         moved_while_exposed(4),
-        moved_while_exposed(8),
+        by_night(moved_while_exposed(8)),
         unequal_pixels,
         with_gamma,
     ],

@@ -66,7 +66,7 @@ def test_the_discs_centres_are_as_uncertain_as_the_outlines():
     centres_px = true_centres_px(scene)
     centres_px[7] = np.nan
     seen = dataclasses.replace(nothing_found(PAPER), centres_px=centres_px)
-    noise_px = rng.normal(scale=0.02, size=(250, len(centres_px), 2))  # above that of a camera
+    noise_px = rng.normal(scale=0.02, size=(120, len(centres_px), 2))  # above that of a camera
     draws_px = np.array(
         [disc_centres(dataclasses.replace(seen, centres_px=centres_px + each), PAPER)[0] for each in noise_px]
     )

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from markers.noise import _order, estimate_noise, full_scale_DN
+from tests.nightly import by_night
 
 from .rendered import Scene, photograph, render, shaded_light
 
 SCENE = Scene(columns=5, rows=4, size=(1000, 800), ground_DN=150, light=shaded_light)
 
 
-@pytest.mark.parametrize(("read_DN", "electrons_per_DN"), [(1.0, 40.0), (3.0, 100.0), (0.7, 10.0)])
+@pytest.mark.parametrize(("read_DN", "electrons_per_DN"), [(1.0, 40.0), by_night(3.0, 100.0), by_night(0.7, 10.0)])
 def test_read_noise_and_shot_noise_are_found_while_the_target_drifts(read_DN, electrons_per_DN):
     scenes = [
         dataclasses.replace(SCENE, shift_mm=(0.03 * k, 0), read_DN=read_DN, electrons_per_DN=electrons_per_DN)

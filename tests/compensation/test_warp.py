@@ -10,6 +10,7 @@ from markers.detection import detect
 from markers.target import load_target
 from stand.config.stand_config import packaged
 from tests.compensation.rendered import Scene, render
+from tests.nightly import by_night
 
 SMALL = (200, 160)
 
@@ -39,8 +40,10 @@ def scene(x, y):
     return total
 
 
-@pytest.mark.parametrize("shift", [drift, across_zero])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize(
+    ("shift", "dtype"),
+    [(drift, np.uint8), (across_zero, np.uint16), by_night(drift, np.uint16), by_night(across_zero, np.uint8)],
+)
 def test_every_pixel_is_that_of_the_scene_at_the_place_it_comes_from(shift, dtype):
     """As near as a cubic B-spline comes in twice the precision, and a little of what rounding leaves."""
     rows, columns = np.mgrid[:150, :210].astype(float)

@@ -12,6 +12,7 @@ import pytest
 from markers.detection import DetectionError, Flag, detect
 from markers.image_file import read_image
 from markers.target import DonutMarkers, OddMarker, Target
+from tests.nightly import by_night
 
 from .rendered import Scene, photograph, render, true_centres_px
 from .test_markers import HALF, PAPER, rms_mpx
@@ -27,8 +28,15 @@ def shifted(scene: Scene, x_px: float, y_px: float) -> Scene:
     return replace(scene, shift_mm=(x_px * per_px, y_px * per_px))
 
 
-@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
-@pytest.mark.parametrize("cut", ["beyond", "half", "a tenth"])
+@pytest.mark.parametrize(
+    ("side", "cut"),
+    [
+        *[("left", "beyond"), ("right", "half"), ("top", "a tenth"), ("bottom", "beyond")],
+        *[by_night("left", "half"), by_night("left", "a tenth"), by_night("right", "beyond")],
+        *[by_night("right", "a tenth"), by_night("top", "beyond"), by_night("top", "half")],
+        *[by_night("bottom", "half"), by_night("bottom", "a tenth")],
+    ],
+)
 def test_a_side_of_the_grid_beyond_the_frame_is_found_by_the_frame(side: str, cut: str):
     scene = replace(SCENE, roll_deg=0)
     truth, (width, height) = true_centres_px(scene), scene.size

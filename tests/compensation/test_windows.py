@@ -12,6 +12,7 @@ from markers.target import load_target
 from markers.windows import MARGIN_px, marker_windows
 from recording.format.images import decode_image
 from recording.format.roi import RoiEncoder
+from tests.nightly import by_night
 
 from .rendered import Scene, photograph, project, render
 
@@ -80,8 +81,13 @@ def partial(images):
     return second.pixels
 
 
-@pytest.mark.parametrize("view", ["frontal", "tilted"])
-@pytest.mark.parametrize(("dtype", "gain"), [(np.uint8, 1), (np.uint16, 16)])
+@pytest.mark.parametrize(
+    ("view", "dtype", "gain"),
+    [
+        *[("frontal", np.uint16, 16), ("tilted", np.uint8, 1)],
+        *[by_night("frontal", np.uint8, 1), by_night("tilted", np.uint16, 16)],
+    ],
+)
 def test_centres_from_a_partial_frame_are_those_of_the_whole_one(view, dtype, gain):
     scene = dataclasses.replace(VIEWS[view], read_DN=float(gain), electrons_per_DN=40.0 / gain)
     moved = dataclasses.replace(scene, shift_mm=(0.05, -0.04))  # 0.2 px

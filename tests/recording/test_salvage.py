@@ -18,6 +18,7 @@ from recording.reading.session import Session
 from recording.repair.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
 from recording.repair.verify import Severity, verify
 from recording.writing.segment import CommitSink
+from tests.nightly import by_night
 from tests.recording.damage import (
     ATTACHMENTS,
     DAMAGES,
@@ -29,7 +30,7 @@ from tests.recording.damage import (
     write_segment,
 )
 
-TRIALS = [60, pytest.param(1000, marks=pytest.mark.nightly)]
+TRIALS = [30, by_night(1000)]
 """Places at which a file is damaged, by day and by night."""
 SERIES = [TELEMETRY, FRAMES]
 
@@ -97,11 +98,12 @@ def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, serie
         assert done.kept is None or done.kept.read_bytes() == data
 
 
+@pytest.mark.parametrize("trials", [15, by_night(300)])
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)
-def test_a_finished_segment_that_is_damaged_is_salvaged_and_kept(damaged, night, series, damage):
+def test_a_finished_segment_that_is_damaged_is_salvaged_and_kept(damaged, night, series, damage, trials):
     rng = random.Random(f"finished {series} {damage.__name__}")
-    for offset in rng.sample(range(len(night[1][series, "finished"].data)), 30):
+    for offset in rng.sample(range(len(night[1][series, "finished"].data)), trials):
         folder, path, written = damaged(series, lambda data, at=offset: damage(data, at, rng), "finished")
         data = path.read_bytes()
         done = {result.source: result for result in salvage_session(folder.parent)}

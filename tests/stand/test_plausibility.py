@@ -22,6 +22,7 @@ from stand.guarding.plausibility import (
 )
 from stand.guarding.rules import Announcements, watches
 from stand.guarding.surroundings import Following, measured, together
+from tests.nightly import by_night
 from tests.stand.chamber_night import START_NS, Night
 
 LIMITS = HeatingConfig(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)
@@ -120,13 +121,13 @@ def faults_of(night: Night) -> list[tuple[float, Fault]]:
 @pytest.mark.parametrize(
     "night",
     [
-        Night([24, 60, -10, 52, 10, 24], 3600),
+        by_night(Night([24, 60, -10, 52, 10, 24], 3600)),
         Night([30, 24, 45, 10, 60, 20, 50, 31, 34, 24], 900),
         Night([24, 55, 24, 40], 2700, compressor_always=True),
-        Night([-10, 60, 0], 3600, laboratory_degC=32),
-        Night([60, -10, 60], 3600, laboratory_degC=10),
+        by_night(Night([-10, 60, 0], 3600, laboratory_degC=32)),
+        by_night(Night([60, -10, 60], 3600, laboratory_degC=10)),
         Night([10], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None),
-        Night([52], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None),
+        by_night(Night([52], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
     ],
     ids=["far", "fast", "compressor fights", "hot laboratory", "cold laboratory", "warming up", "cooling down"],
 )

@@ -10,6 +10,7 @@ from stand.config.stand_config import StandConfig, packaged
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from stand.simulator import Simulator
+from tests.nightly import by_night
 from tests.stand.guarded_recipes import RECIPES
 from tests.system.conftest import AS_INSTALLED, CORNER, WHOLE_SENSOR, require_aravis
 from tests.system.test_guard_wire import Bench, bench_of
@@ -67,7 +68,7 @@ async def _check(bench: Bench, failure: str) -> None:
     assert bench.trips or failure in HARMLESS
 
 
-@pytest.mark.parametrize("failure", ["both stuck low", "both out of the chamber"])
+@pytest.mark.parametrize("failure", ["both stuck low", by_night("both out of the chamber")])
 async def test_the_heat_is_cut_before_the_air_is_too_warm(order: Callable[..., Order], simulator: Start, failure: str):
     require_aravis()
     async with bench_of(order(simulation={"chamber_seed": 9}), simulator) as bench:
