@@ -47,7 +47,7 @@ class Bench:
             if wire == "serial"
             else TcpWire("127.0.0.1", 0, self.fake.engine, self.faults)
         )
-        known: dict[str, object] = {"protocol": make, "address": self.line.address, "timeout_s": 0.1, "gap_s": 0.0}
+        known: dict[str, object] = {"protocol": make, "address": self.line.address, "timeout_s": 0.3, "gap_s": 0.0}
         if make not in ("espec", "simserv"):
             known["limits_at_panel_degC"] = list(ALLOWED_DEGC)
         if make in ("cts", "julabo"):
@@ -315,7 +315,7 @@ async def test_a_late_reply_is_never_taken_for_the_next_one(make: str, wire: str
     async with bench_of(make, wire, tmp_path) as bench:
         await bench.driver.open()
         for value_degC in (30.0, 35.0, 40.0):
-            bench.faults.late_s = 0.13  # after the time-out, within the quarantine
+            bench.faults.late_s = 0.33  # after the time-out, within the quarantine
             bench.fake.stuck_degC = value_degC - 1
             with pytest.raises(DeviceError) if wire == "tcp" else _nothing():
                 await bench.driver.read()
@@ -332,13 +332,13 @@ class _nothing:
 @pytest.mark.parametrize(("make", "wire"), ON_WIRES)
 async def test_among_hundreds_of_reads_with_faults_no_temperature_is_wrong(make: str, wire: str, tmp_path: Path):
     """ASCII-2 and ESPEC have no checksum: no bit flips, which nothing could find; lost, cut and late replies are."""
-    async with bench_of(make, wire, tmp_path, timeout_s=0.02) as bench:
+    async with bench_of(make, wire, tmp_path, timeout_s=0.05) as bench:
         await bench.driver.open()
         faults = bench.faults
         faults.drop = faults.cut = faults.late = 0.01
-        faults.late_by_s = 0.03
+        faults.late_by_s = 0.08
         read = 0
-        for number_ in range(150):
+        for number_ in range(120):
             bench.fake.stuck_degC = 20.0 + number_ / 10
             try:
                 found = await bench.read()
@@ -346,7 +346,7 @@ async def test_among_hundreds_of_reads_with_faults_no_temperature_is_wrong(make:
                 continue
             read += 1
             assert found["pv"].value == pytest.approx(bench.fake.stuck_degC, abs=0.051)
-        assert read > 100
+        assert read > 80
 
 
 @pytest.mark.parametrize("make", MAKES)

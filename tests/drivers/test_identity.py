@@ -38,7 +38,7 @@ class Bench:
         self.module = FakeThermometers(plant, clock, 3, {"air": 0}, seed=1)
         units = [self.board, self.module]
         self.wire = TcpWire("127.0.0.1", 0, lambda: TcpEngine(units), LinkFaults())
-        self.bus = Bus("bus", BusSettings(address=self.wire.address, timeout_s=0.1), WallClock())
+        self.bus = Bus("bus", BusSettings(address=self.wire.address, timeout_s=0.3), WallClock())
         relay_map = load_register_map(MAPS / "waveshare-relay.yaml").at_unit(2)
         self.relays = Relays("relays", self.bus, relay_map, {"heater_enable": 0, "compressor": 1})
         module_map = load_register_map(MAPS / "icpdas-m7015.yaml").at_unit(3)

@@ -105,7 +105,7 @@ def clock() -> SettableClock:
 async def regulator(serve_modbus: Serve, unit: E5cc, clock: SettableClock) -> AsyncIterator[Regulator]:
     """Not yet opened."""
     address = await serve_modbus([unit.device()], [])
-    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.1, gap_s=0.0), clock)
+    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.3, gap_s=0.0), clock)
     await bus.open()
     yield Regulator("regulator", bus, MAP, clock)
     await bus.close()

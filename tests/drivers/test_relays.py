@@ -66,7 +66,7 @@ async def bus(serve_modbus: Serve, board: type[BoardWrite]) -> AsyncIterator[Bus
     coils = [SimData(0, values=[False] * 8, datatype=DataType.BITS)]
     words = [SimData(0, values=0, datatype=DataType.REGISTERS)]
     address = await serve_modbus([SimDevice(UNIT, simdata=(coils, coils, words, words))], [board])
-    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.1, gap_s=0.0), WallClock())
+    bus = Bus("rs485", BusSettings(address=address, timeout_s=0.3, gap_s=0.0), WallClock())
     await bus.open()
     yield bus
     await bus.close()

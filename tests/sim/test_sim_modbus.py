@@ -167,7 +167,7 @@ def test_a_header_of_another_protocol_is_skipped_behind_the_gateway() -> None:
 def bus(tmp_path: Path) -> Iterator[tuple[LinkFaults, ModbusSerialClient]]:
     faults = LinkFaults()
     wire = PtyWire(tmp_path / "bus", RtuEngine([Store(1), Store(7)]), faults)
-    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=115200, timeout=0.3, retries=0)
+    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=115200, timeout=3.0, retries=0)
     assert client.connect()
     yield faults, client
     client.close()
@@ -186,6 +186,7 @@ def test_pymodbus_reads_and_writes_over_a_pseudo_terminal(bus: tuple[LinkFaults,
 
 def test_pymodbus_gets_no_answer_from_a_unit_that_is_not_there(bus: tuple[LinkFaults, ModbusSerialClient]) -> None:
     faults, client = bus
+    client.comm_params.timeout_connect = 0.1
     with pytest.raises(ModbusIOException):
         client.read_holding_registers(0, count=1, device_id=9)
     client.comm_params.timeout_connect = 3.0
@@ -196,7 +197,7 @@ def test_pymodbus_gets_no_answer_from_a_unit_that_is_not_there(bus: tuple[LinkFa
 def test_pymodbus_reads_through_the_gateway() -> None:
     units = [Store(1), Store(2)]
     wire = TcpWire("127.0.0.1", 0, lambda: TcpEngine(units), LinkFaults())
-    client = ModbusTcpClient("127.0.0.1", port=wire.port, timeout=1, retries=0)
+    client = ModbusTcpClient("127.0.0.1", port=wire.port, timeout=5, retries=0)
     assert client.connect()
     assert client.read_input_registers(0x20, count=3, device_id=2).registers == [0x20, 0x21, 0x22]
     assert not client.write_register(9, 99, device_id=1).isError()

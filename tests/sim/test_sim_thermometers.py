@@ -204,7 +204,7 @@ def test_an_unknown_sensor_or_channel_number_is_a_mistake_of_the_caller(bench: B
 
 def test_pymodbus_reads_values_bits_and_type_codes_through_a_gateway(bench: Bench) -> None:
     wire = TcpWire("127.0.0.1", 0, lambda: TcpEngine([bench.module]), LinkFaults())
-    client = ModbusTcpClient("127.0.0.1", port=wire.port, timeout=1, retries=0)
+    client = ModbusTcpClient("127.0.0.1", port=wire.port, timeout=5, retries=0)
     assert client.connect()
     registers = client.read_input_registers(0, count=6, device_id=3).registers
     assert registers[3] * LSB_K == pytest.approx(30.0, abs=0.02)
