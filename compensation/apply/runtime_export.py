@@ -7,11 +7,15 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
+
+from compensation.drift.between_nights import BetweenNights
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_model import PaperModel
 from compensation.drift.polynomial import exponents
 from compensation.drift.terms import Kind, Term
 from compensation.drift.thermal_model import ThermalModel
+from compensation.history.states import Float
 from foundation.files import make_folder, write_whole
 
 MODEL_NAME, MODULE_NAME = "drift.json", "drift_runtime.py"
@@ -43,7 +47,7 @@ def runtime_model(model: DriftModel) -> dict[str, object]:
         "image_size_px": facts.image_size,
         "camera_range_degC": facts.camera_range_degC,
         "reference_degC": facts.reference_degC,
-        "discrepancy_px": model.discrepancy_px.tolist(),
+        "discrepancy_px": _left_px(model).tolist(),
         "hull_px": facts.hull_px.tolist(),
     }
     match model:
@@ -54,6 +58,15 @@ def runtime_model(model: DriftModel) -> dict[str, object]:
         case _:
             raise TypeError(f"no runtime for a model of form {model.form}")
     return {**common, **of_form}
+
+
+def _left_px(model: DriftModel) -> Float:
+    """(2,): on nights that were not fitted, as those are on which a running camera asks."""
+    match model:
+        case ThermalModel(between_nights=BetweenNights(sigma_px=between_px)):
+            return np.hypot(model.discrepancy_px, between_px)
+        case _:
+            return model.discrepancy_px
 
 
 def _term(term: Term) -> list[str | float]:

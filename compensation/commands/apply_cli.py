@@ -199,6 +199,7 @@ def _correct_points(
     if session is not None:
         _refuse(("--camera-degC", camera_degC), why="the session has it")
         states = _recorded_states(model, session, times(source, rows))
+        model = model.of_sessions([session.metadata.get("session_id", "")])
     elif camera_degC is not None or (rows and CAMERA in rows[0]):
         model = _without_history(model)
         degC = numbers(source, rows, CAMERA) if camera_degC is None else camera_degC

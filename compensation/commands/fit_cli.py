@@ -17,6 +17,7 @@ from compensation.drift.choosing import fit as fit_model
 from compensation.drift.evaluation import Evaluation, evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
+from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.unrepeated import Cause, find_unrepeated
 from compensation.observations import Observations
 from compensation.reporting.equipment import equipment_of
@@ -68,8 +69,9 @@ def fit(
     A table has a row for each centre: frame, marker, x_px, y_px, camera_degC, and where known time_ns, chamber_degC,
     role, air_degC, var_x_px2, cov_xy_px2, var_y_px2. It needs no session and no stand.
 
-    One night does not show all that another brings: a dead zone in a mount or a thermometer far from the camera may err
-    by 20 to 60 mpx there. Two nights over the same set-points, in another order, show it and claim it.
+    One night does not show how well nights repeat: a dead zone in a mount or a thermometer far from the camera may err
+    by 20 mpx and more on another one. What that adds is assumed then, and the model says so; two nights over the same
+    set-points, in another order, measure it.
 
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
@@ -89,8 +91,10 @@ def fit(
         data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
         stepped = [_bump_line(each, observations) for each in bumps]
         stepped += [f"{one.session_id}: {one.text}" for one in named]
+        repeats = model.between_nights if isinstance(model, ThermalModel) else None
+        stepped += [] if repeats is None else [repeats.text]
         lines = [f"{model.form}: {model.title}", *stepped, table(evaluation)]
-        show({**data, "unrepeated": named, **_scores(evaluation)}, lines)
+        show({**data, "unrepeated": named, "between_nights": repeats, **_scores(evaluation)}, lines)
 
 
 def _bump_line(bump: Bump, observations: Observations) -> str:

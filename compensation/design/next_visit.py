@@ -87,11 +87,12 @@ def decide(observations: Observations, wanted: Wanted) -> Decision:
 
 
 def predicted_residual_px(model: ThermalModel, asked: Situation) -> float:
-    """RMS of a coordinate over these situations and the outline of the markers."""
+    """RMS of a coordinate over these situations and the outline of the markers, within the night."""
     hull_px = model.facts.hull_px
     situations, places = len(asked.air_degC), len(hull_px)
     states = asked.states.where(np.repeat(np.arange(situations), places))
-    covariance = model.covariance(np.tile(hull_px, (situations, 1)), states)
+    own = model.of_sessions(model.facts.session_ids)
+    covariance = own.covariance(np.tile(hull_px, (situations, 1)), states)
     return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 2))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntFlag
 from typing import Protocol
 
@@ -83,6 +84,10 @@ class DriftModel(Protocol):
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`."""
+        ...
+
+    def of_sessions(self, session_ids: Iterable[str]) -> DriftModel:
+        """The model for these sessions: `covariance` is of any night, and smaller of those that were fitted."""
         ...
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:

@@ -87,7 +87,8 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
         method = "no held-out frames: one temperature left out at a time"
     rows, after = _answered(rows, after)
     at_rows = states.where(rows.frame)
-    claimed = np.diagonal(model.covariance(rows.measured_px, at_rows), axis1=1, axis2=2) + rows.variance_px2
+    own = model.of_sessions(session.session_id for session in observations.sessions)
+    claimed = np.diagonal(own.covariance(rows.measured_px, at_rows), axis1=1, axis2=2) + rows.variance_px2
     return Evaluation(
         method=method,
         held_out=bool(frames.any()),

@@ -3,7 +3,8 @@
 A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form, those
 before version 4 know of no bumps, those before version 5 have correlations between the motions, which are dropped,
 those before version 6 no powers of the air's lags, those before version 7 claim too little on another night: their
-covariance is also the matrix of leverage; those before version 8 have no plays of parts.
+covariance is also the matrix of leverage. Those before version 8 have no plays of parts, and what another night adds is
+in their discrepancy.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, TypeAdapter
 
+from compensation.drift.between_nights import BetweenNights
 from compensation.drift.bump import Bump
 from compensation.drift.candidates import Candidate, Pair
 from compensation.drift.drift_model import DriftModel
@@ -79,7 +81,8 @@ class TermFile(Document):
 
 class ThermalFile(_File):
     """The thermal form. coefficient_covariance_px2 (8 H, H): of each motion one below the other. least_on_s: null when
-    the camera was never switched on within the record. usual_leverage_px2: in older files."""
+    the camera was never switched on within the record. usual_leverage_px2: in older files. between_nights_px: one
+    standard deviation of what a night that was not fitted adds; with nights_compared 0 it was assumed, not measured."""
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[TermFile, ...]
@@ -96,6 +99,8 @@ class ThermalFile(_File):
     leverage_px2: float | None = None
     usual_leverage_px2: float | None = None
     history_s: float | None = None
+    between_nights_px: Pair | None = None
+    nights_compared: Annotated[int, Field(ge=0)] = 0
     other: PaperFile | None = None
 
 
@@ -180,6 +185,8 @@ def _thermal_fields(model: ThermalModel) -> dict[str, object]:
         "least_on_s": _finite(model.valid.least_on_s),
         "leverage_px2": _finite(model.valid.leverage),
         "history_s": model.valid.history_s,
+        "between_nights_px": None if model.between_nights is None else model.between_nights.sigma_px,
+        "nights_compared": 0 if model.between_nights is None else model.between_nights.nights,
     }
 
 
@@ -232,6 +239,9 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         ),
         has_warm_up=file.has_warm_up,
         candidates=file.candidates,
+        between_nights=None
+        if file.between_nights_px is None
+        else BetweenNights(file.between_nights_px, file.nights_compared),
     )
 
 

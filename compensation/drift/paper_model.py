@@ -7,6 +7,7 @@ the space, so this is the same fit as that of the reference positions. compensat
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -103,6 +104,10 @@ class PaperModel:
         terms = self._terms(xy_px, state)
         variance = np.einsum("nk,ckl,nl->nc", terms, self.coefficient_covariance, terms) + self.discrepancy_px**2
         return variance[:, :, None] * np.eye(2)
+
+    def of_sessions(self, session_ids: Iterable[str]) -> PaperModel:
+        """Itself: what another night adds is small beside what this form leaves."""
+        return self
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside: PLACE and CAMERA."""

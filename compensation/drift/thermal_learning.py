@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.drift.between_nights import between_nights
 from compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px
 from compensation.drift.displacements import Displacements
 from compensation.drift.facts import facts_of
@@ -86,22 +87,25 @@ def _held_out(
 
 
 def _discrepancy_px(taught: _Taught) -> Float:
-    """(2,): of set-points left out; of several nights also of nights left out, which shows what of the drift does not
-    repeat between them; and what wanders. The largest of them."""
-    trained, rows = taught.trained, taught.rows
-    moved = motions(rows.measured_px, trained.observations.image_size)
+    """(2,): of set-points left out, or what wanders, the larger of both."""
+    moved = motions(taught.rows.measured_px, taught.trained.observations.image_size)
     wander_px = np.sqrt((moved**2 @ taught.learned.wander_px2).mean(axis=0))
-    found = np.maximum(discrepancy_px(rows, taught.held_out), wander_px)
+    return np.maximum(discrepancy_px(taught.rows, taught.held_out), wander_px)
+
+
+def _nights_left_out_px2(taught: _Taught) -> Float:
+    """(N, 2): mean square that is left of each night by what the others teach, noise taken off, which shows what of the
+    drift does not repeat between them; of the nights that can be compared."""
+    trained, rows = taught.trained, taught.rows
     night = trained.observations.session[rows.frame].astype(float)
     nights = [index for index in np.unique(night).tolist() if _others_know(rows.chamber_degC, night, index)]
     if not nights:
-        return found
+        return np.zeros((0, 2))
     own = rows.where(np.isin(night, nights))
     night = trained.observations.session[own.frame].astype(float)
     left = _held_out(trained, taught.learned, own, taught.learned.instants.session.astype(float), night)
     squares = left**2 - own.variance_px2
-    each = np.array([squares[night == index].mean(axis=0) for index in nights])
-    return np.maximum(found, np.sqrt(np.maximum(each.mean(axis=0), 0.0)))
+    return np.array([squares[night == index].mean(axis=0) for index in nights])
 
 
 def _others_know(chamber_degC: Float, night: Float, index: float) -> bool:
@@ -128,7 +132,7 @@ def _candidate(taught: _Taught) -> Candidate:
 
 
 def _model(taught: _Taught, heating_K: float) -> ThermalModel:
-    trained, learned = taught.trained, taught.learned
+    trained, learned, left_px = taught.trained, taught.learned, _discrepancy_px(taught)
     camera_degC = _extent(trained.states.camera_degC[np.unique(trained.rows.frame)])
     found = ThermalModel(
         facts=facts_of(trained.observations, taught.rows, camera_degC, trained.origin.camera_degC),
@@ -139,10 +143,11 @@ def _model(taught: _Taught, heating_K: float) -> ThermalModel:
         coefficients=learned.coefficients,
         coefficient_covariance=learned.covariance + _DOUBT * learned.doubt(learned.instants.chamber_degC),
         leverage_matrix=learned.covariance[0] + learned.covariance[1],
-        discrepancy_px=_discrepancy_px(taught),
+        discrepancy_px=left_px,
         valid=_range(trained),
         has_warm_up=bool(trained.observations.of(Role.WARM_UP).any()),
         candidates=(_candidate(taught),),
+        between_nights=between_nights(left_px, _nights_left_out_px2(taught)),
     )
     largest = float(found.leverage(trained.states.where(np.unique(trained.rows.frame))).max())
     return replace(found, valid=replace(found.valid, leverage=largest, history_s=_history_s(found)))

@@ -8,10 +8,12 @@ compensation/drift/thermal_learning.py makes the model.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from compensation.drift.between_nights import BetweenNights
 from compensation.drift.candidates import Candidate, Pair
 from compensation.drift.drift_model import (
     DriftModel,
@@ -57,8 +59,9 @@ class ThermalModel:
     the covariance has beyond that; it says which states are like those of the fit.
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
     the shift at the reference is about 0. discrepancy_px (2,): what the form leaves unexplained at temperatures not
-    fitted, one standard deviation, marker noise taken off. has_warm_up: whether a warm-up was among the training
-    frames. candidates, other: as in PaperModel.
+    fitted, one standard deviation, marker noise taken off; within nights. between_nights: what another night adds to
+    it, which `covariance` contains; None in older models, in which the discrepancy has it, and of nights that were
+    fitted. has_warm_up: whether a warm-up was among the training frames. candidates, other: as in PaperModel.
     """
 
     facts: ModelFacts
@@ -74,6 +77,7 @@ class ThermalModel:
     has_warm_up: bool
     candidates: tuple[Candidate, ...]
     other: DriftModel | None = None
+    between_nights: BetweenNights | None = None
 
     @property
     def form(self) -> str:
@@ -105,13 +109,24 @@ class ThermalModel:
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: of the coefficients, which
         know little of a state unlike those of the fit, and of what the form leaves unexplained. That was seen at
-        set-points that were left out, and is taken to grow with the leverage beyond the largest of the fit."""
+        set-points that were left out, and is taken to grow with the leverage beyond the largest of the fit. On any
+        night but those fitted: of these ask the model that `of_sessions` gives."""
         found = self._features(state, len(xy_px))
         moved = motions(xy_px, self.facts.image_size)
         variance = np.einsum("nh,mhk,nk->nm", found, self.coefficient_covariance, found, optimize=True)
         more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0)
         of_coefficients = (moved * variance[:, None, :]) @ moved.transpose(0, 2, 1)
-        return of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
+        unexplained = of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
+        return (
+            unexplained
+            if self.between_nights is None
+            else unexplained + np.diag(np.square(self.between_nights.sigma_px))
+        )
+
+    def of_sessions(self, session_ids: Iterable[str]) -> ThermalModel:
+        """The model for these sessions: where it was fitted to all of them, without what other nights add."""
+        is_own = set(session_ids) <= set(self.facts.session_ids)
+        return replace(self, between_nights=None) if is_own else self
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside."""

@@ -22,7 +22,7 @@ from compensation.observations import Observations
 from foundation.errors import SessionError
 
 _FEWEST = 3
-_APART = 0.3
+_APART = 0.1
 """Of the scatter: this part is taken for independent of one term to the next, for a few units show few directions.
 Chosen on 8 drawn types, judged on 10 others (docs/decisions.md)."""
 

@@ -179,6 +179,7 @@ def uncertainty_section(numbers: Numbers) -> Iterator[Part]:
         [
             ("measured deviation of a centre (markers)", *_mpx(score.marker_sigma_px)),
             ("unexplained by the form at temperatures left out", *_mpx(model.discrepancy_px)),
+            *_another_night(model),
             ("compensated centre, as claimed", *_mpx(score.claimed_sigma_px)),
             ("compensated centre, as found (RMS)", *_mpx(score.after_px)),
             ("part within the claimed 95 % interval", *(percent(100 * part) for part in score.coverage_95)),
@@ -190,13 +191,28 @@ def uncertainty_section(numbers: Numbers) -> Iterator[Part]:
             "wider than it had to be. It stands for other nights and other ways to a temperature too, which these do "
             "not show."
         )
-    if len(model.session_ids) == 1:
-        yield Paragraph(
-            "Of one night. What differs between nights is estimated from how its set-points agree: a dead zone in a "
-            "mount, or a thermometer far from the camera, may leave 20 to 60 mpx on another night that one night does "
-            "not show. A second night over the same set-points, in another order and fitted with this one, shows it, "
-            "and the interval then contains it."
-        )
+    if model.nights_compared == 0 and (model.between_nights_px is not None or len(model.session_ids) == 1):
+        yield Paragraph(_one_night(model))
+
+
+def _one_night(model: ModelNumbers) -> str:
+    """What is known of other nights where none were compared."""
+    added = (
+        "is not known, and not in the uncertainty"
+        if model.between_nights_px is None
+        else "was assumed, not measured, from cameras of published numbers"
+    )
+    return (
+        f"How well nights repeat {added}: a dead zone in a mount, or a thermometer far from the camera, may leave 20 "
+        "mpx and more on another night. A second night over the same set-points, in another order and fitted with this "
+        "one, measures it."
+    )
+
+
+def _another_night(model: ModelNumbers) -> Iterator[tuple[str, ...]]:
+    if model.between_nights_px is not None:
+        known = f"of {model.nights_compared} compared" if model.nights_compared else "assumed"
+        yield f"added by a night that was not fitted, {known}", *_mpx(model.between_nights_px)
 
 
 def _mpx(values_px: tuple[float, float]) -> Iterator[str]:

@@ -17,6 +17,7 @@ from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
 from compensation.drift.hysteresis import Hysteresis, hysteresis
+from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.drift.unrepeated import find_unrepeated
 from compensation.observations import Float, Mask, Observations
@@ -212,6 +213,7 @@ def _hysteresis(found: tuple[Hysteresis, ...]) -> tuple[HysteresisNumbers, ...]:
 def _model(model: DriftModel) -> ModelNumbers:
     facts = model.facts
     i, j = model.discrepancy_px.tolist()
+    known = model.between_nights if isinstance(model, ThermalModel) else None
     return ModelNumbers(
         form=model.form,
         title=model.title,
@@ -220,6 +222,8 @@ def _model(model: DriftModel) -> ModelNumbers:
         camera_range_degC=facts.camera_range_degC,
         hull_px=tuple((x, y) for x, y in facts.hull_px.tolist()),
         discrepancy_px=(i, j),
+        between_nights_px=None if known is None else known.sigma_px,
+        nights_compared=0 if known is None else known.nights,
         session_ids=facts.session_ids,
         software_version=facts.software_version,
         formula=formula_of(model),

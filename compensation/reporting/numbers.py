@@ -152,7 +152,8 @@ class FormulaNumbers:
 
 @dataclass(frozen=True, slots=True)
 class ModelNumbers:
-    """candidates: every form tried, with its errors at temperatures left out."""
+    """candidates: every form tried, with its errors at temperatures left out. between_nights_px: what a night that was
+    not fitted adds, None where that is not known; with nights_compared 0 it was assumed, not measured."""
 
     form: str
     title: str
@@ -161,6 +162,8 @@ class ModelNumbers:
     camera_range_degC: Pair
     hull_px: tuple[Pair, ...]
     discrepancy_px: Pair
+    between_nights_px: Pair | None
+    nights_compared: int
     session_ids: tuple[str, ...]
     software_version: str
     formula: FormulaNumbers

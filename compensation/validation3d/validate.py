@@ -199,6 +199,7 @@ class Corrected:
 def corrected(observations: Observations, frames: ValidationFrames, model: DriftModel) -> Corrected:
     """Every marker of the frames that are used."""
     states = frame_states(observations, model.memory)
+    model = model.of_sessions(session.session_id for session in observations.sessions)
     centres_px = np.full(observations.centres_px.shape, np.nan)
     model_px2 = np.full(observations.covariance_px2.shape, np.nan)
     flags = np.zeros(centres_px.shape[:2], np.uint8)

@@ -28,7 +28,7 @@ def figures() -> Iterator[Figure]:
         camera = drawn_camera(seed, *effects_of(seed, unrepeating=False)[0])
         begin = [*warm_up(), *reference()]
         model = fit(night(camera, [*begin, *cycle(FITTED_DEGC, HELD_OUT_DEGC)], seed).observed)
-        asked = night(camera, [*begin, *cycle(ASKED_DEGC, ASKED_DEGC)], seed + 50)
+        asked = night(camera, [*begin, *cycle(ASKED_DEGC, ASKED_DEGC)], seed + 50, session_id="night-2")
         scores.append(score(model, asked, Role.VALIDATION))
     covered = 100 * float(np.mean([one.covered for one in scores]))
     what = "drift, 95 % interval beyond what was fitted"

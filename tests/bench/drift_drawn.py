@@ -54,6 +54,7 @@ def score(model: DriftModel, made: Night, role: str = Role.VALIDATION) -> Score:
     observed, truth = made.observed, made.truth_px
     reference_px = truth[observed.of(Role.REFERENCE)].mean(axis=0)
     states = frame_states(observed, model.memory)
+    model = model.of_sessions(one.session_id for one in observed.sessions)
     left, claimed, flags = [], [], []
     for frame in np.flatnonzero(observed.of(role)).tolist():
         state = states.where(np.array([frame]))

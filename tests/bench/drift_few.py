@@ -36,7 +36,7 @@ def _few(way_degC: tuple[int, ...]) -> Iterator[Figure]:
         camera = drawn_camera(seed, *effects_of(seed, unrepeating=False)[0])
         begin = [*warm_up(), *reference()]
         chosen = fit(night(camera, [*begin, *cycle(way_degC, ())], seed).observed)
-        asked = night(camera, [*begin, *cycle(ASKED_DEGC, ASKED_DEGC)], seed + 50)
+        asked = night(camera, [*begin, *cycle(ASKED_DEGC, ASKED_DEGC)], seed + 50, session_id="night-2")
         models = {model.form: model for model in (chosen, chosen.other) if model is not None}
         left = {form: score(model, asked, Role.VALIDATION).rms_mpx for form, model in models.items()}
         thermal.append(left["thermal"])

@@ -28,7 +28,7 @@ def figures() -> Iterator[Figure]:
         effects = effects_of(seed, unrepeating=False)[0]
         units = [fit_thermal(night(drawn_unit(seed, k, *effects), full_night(), k).observed) for k in range(UNITS)]
         new, begin = drawn_unit(seed, NEW, *effects), [*warm_up(), *reference()]
-        asked = night(new, [*begin, *cycle(ASKED_DEGC, ASKED_DEGC)], NEW + 200)
+        asked = night(new, [*begin, *cycle(ASKED_DEGC, ASKED_DEGC)], NEW + 200, session_id="night-2")
         few = fit_like(night(new, [*begin, *cycle(SEEN_DEGC, ())], NEW + 100).observed, units)
         found = score(few, asked, Role.VALIDATION)
         left.append(found.rms_mpx)

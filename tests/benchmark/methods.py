@@ -47,12 +47,13 @@ def corrector(model: DriftModel) -> Corrector:
 
     def corrected(night: Observations, frames: NDArray[np.int64], seen_px: Float) -> Correction:
         states = frame_states(night, model.memory)
+        asked = model.of_sessions(one.session_id for one in night.sessions)
         places, sigma = np.empty_like(seen_px), np.empty_like(seen_px)
         inside = np.empty(seen_px.shape[:2], bool)
         for row, frame in enumerate(frames.tolist()):
             state = states.where(np.array([frame]))
             places[row] = model.correct(seen_px[row], state)
-            sigma[row] = np.sqrt(np.diagonal(model.covariance(seen_px[row], state), axis1=1, axis2=2))
+            sigma[row] = np.sqrt(np.diagonal(asked.covariance(seen_px[row], state), axis1=1, axis2=2))
             inside[row] = model.inside(seen_px[row], state)
         return Correction(places, sigma, inside)
 

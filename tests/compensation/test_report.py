@@ -200,9 +200,20 @@ def test_an_interval_that_claims_too_much_is_reported(numbers: Numbers):
 
 def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers):
     assert numbers.model is not None
-    two = replace(numbers, model=replace(numbers.model, session_ids=("night-1", "night-2")))
-    for given, is_said in ((numbers, True), (two, False)):
-        assert ("A second night over the same set-points" in page_of("", list(uncertainty_section(given)))) == is_said
+    two = replace(
+        numbers.model, session_ids=("night-1", "night-2"), nights_compared=2, between_nights_px=(0.004, 0.009)
+    )
+    paper = replace(numbers.model, between_nights_px=None)
+    for model, said, row in (
+        (numbers.model, "was assumed, not measured", "fitted, assumed"),
+        (two, "", "fitted, of 2 compared"),
+        (paper, "is not known", ""),
+    ):
+        page = page_of("", list(uncertainty_section(replace(numbers, model=model))))
+        assert (f"How well nights repeat {said}" in page) == bool(said)
+        assert ("How well nights repeat" in page) == bool(said)
+        assert ("added by a night that was not" in page) == bool(row)
+        assert row in page
 
 
 def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):

@@ -8,6 +8,7 @@ import numpy as np
 
 from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.training import frame_states
 from compensation.observations import concatenate
 
 from .drawn_cameras import Camera, drawn_camera
@@ -31,9 +32,23 @@ def thermal(*nights: Night) -> ThermalModel:
 
 def test_what_does_not_repeat_between_nights_is_claimed() -> None:
     nights = [made(drawn_camera(SEED), number) for number in range(2)]
-    alone, together = thermal(nights[0]), thermal(*nights)
-    assert together.discrepancy_px[1] > 0.006 > 2 * alone.discrepancy_px[1]
-    assert together.discrepancy_px[0] < 0.003
+    alone, together = (model.between_nights for model in (thermal(nights[0]), thermal(*nights)))
+    assert alone is not None
+    assert together is not None
+    assert (alone.nights, together.nights) == (0, 2)
+    assert together.sigma_px[1] > 0.006 > 1.5 * alone.sigma_px[1]
+    assert together.sigma_px[0] < 0.003
+
+
+def test_it_is_added_on_another_night_only() -> None:
+    first, other = (made(drawn_camera(SEED), number) for number in range(2))
+    model = thermal(first)
+    places, state = first.truth_px[0], frame_states(first.observed, model.memory).where(np.array([0]))
+    own, any_night = model.of_sessions(["night-0"]), model.of_sessions(["night-0", "night-1"])
+    assert model.between_nights is not None
+    more = any_night.covariance(places, state) - own.covariance(places, state)
+    np.testing.assert_allclose(more, np.tile(np.diag(np.square(model.between_nights.sigma_px)), (54, 1, 1)), atol=1e-12)
+    assert thermal(first, other).of_sessions(["night-1"]).between_nights is None
 
 
 def test_a_night_that_the_others_cannot_do_without_says_nothing() -> None:
@@ -42,4 +57,7 @@ def test_a_night_that_the_others_cannot_do_without_says_nothing() -> None:
     far = np.abs(few.observed.chamber_degC - 24.0) > 8
     reasons = tuple("not of this night" if out else why for out, why in zip(far, few.observed.reasons, strict=True))
     short = Night(replace(few.observed, reasons=reasons), few.truth_px)
-    assert thermal(whole, short).discrepancy_px[1] < 0.006
+    found = thermal(whole, short).between_nights
+    assert found is not None
+    assert found.nights == 1
+    assert found.sigma_px[1] < 0.006
