@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from markers.compiled import compiled
-from markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, VALUE, Pixels, U, V
+from markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, VALUE, Pixels, Single, U, V
 
 CX, CY, M11, M12, M22, SIGMA, B0, BX, BY, F0, FX, FY = range(12)
 PARAMETERS = 12
@@ -30,8 +30,6 @@ PARAMETERS = 12
 Float = NDArray[np.float64]
 Variance = tuple[float, float]
 """floor_DN2 and slope_DN of a `Noise`."""
-
-Single = NDArray[np.float32]
 
 BLOCK = 256
 """Pixels whose derivatives are held at a time: they stay in the processor's nearest cache. They are in single
@@ -83,50 +81,58 @@ class EdgeState:
 
 @compiled
 def normal_equations(
-    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float
+    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float, is_known: bool = False
 ) -> tuple[float, float]:
-    """Set J'WJ (12, 12) and J'We (12,) at the parameters `p`, write each pixel's residual, and return the sum of
-    squared residuals and the sum of the pixels' shares."""
-    normal[:] = 0
+    """Set J'WJ (12, 12), unless it is known well enough from parameters near by, and J'We (12,) at the parameters `p`,
+    write each pixel's residual, and return the sum of squared residuals and the sum of the pixels' shares."""
+    levels = np.zeros((PARAMETERS, PARAMETERS))
     right[:] = 0
-    squares, weights = _core_equations(pixels.table[CORE], pixels.counts[CORE], p, scale, noise, normal, right)
+    squares, weights = 0.0, 0.0
     for region, first in ((GROUND, B0), (DISC, F0)):
-        more = _level_equations(pixels.table[region], pixels.counts[region], p, scale, noise, normal, right, first)
+        more = _level_equations(pixels, region, p, scale, noise, levels, right, first)
         squares += more[0]
         weights += more[1]
-    for i in range(PARAMETERS):
-        for j in range(i):
-            normal[i, j] = normal[j, i]
-    return squares, weights
+    if not is_known:
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
+                normal[i, j] = levels[i, j]
+    more = _core_equations(pixels, p, scale, noise, normal, right, is_known)
+    if not is_known:
+        for i in range(PARAMETERS):
+            for j in range(i):
+                normal[i, j] = normal[j, i]
+    return squares + more[0], weights + more[1]
 
 
 @compiled
 def _core_equations(
-    table: Float, count: int, p: Float, scale: float, noise: Variance, normal: Float, right: Float
+    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float, is_known: bool
 ) -> tuple[float, float]:
-    """Add the pixels near the outline to the upper half of `normal`, and to `right`."""
+    """Add the pixels near the outline to the upper half of `normal`, unless that is known, and to `right`."""
     rows = np.empty((ROWS, BLOCK), np.float32)
     block = rows.ravel()
     squares, weights = 0.0, 0.0
-    for first in range(0, count, BLOCK):
-        size = load_block(block, table, first, count, p, scale)
+    for first in range(0, pixels.counts[CORE], BLOCK):
+        size = load_block(block, pixels, CORE, first, p, scale)
         more = derivatives(block, size, p, scale, noise)
         squares += more[0]
         weights += more[1]
-        _keep_residuals(block, size, table, first)
+        _keep_residuals(block, size, pixels.table[CORE], first)
         for i in range(0, PARAMETERS, 3):
-            for j in range(i, PARAMETERS, 3):
+            for j in range(PARAMETERS if is_known else i, PARAMETERS, 3):
                 _add_products(rows, i, j, size, normal)
             _add_right(rows, i, size, right)
     return squares, weights
 
 
 @compiled
-def load_block(block: Single, table: Float, first: int, count: int, p: Float, scale: float) -> int:
-    """Copy the pixels from `first` on into a block, as many as there is room for; their number."""
-    size, at = min(BLOCK, count - first), np.uint64(first)  # unsigned: not looked at for being negative
+def load_block(block: Single, pixels: Pixels, region: int, first: int, p: Float, scale: float) -> int:
+    """Copy the pixels of a region from `first` on into a block, as many as there is room for; their number."""
+    table, size = pixels.table[region], min(BLOCK, pixels.counts[region] - first)
+    at = np.uint64(first)  # unsigned: not looked at for being negative
     u, v, value, share = table[U], table[V], table[VALUE], table[SHARE]
-    cx, cy, per_scale = p[CX], p[CY], 1 / scale
+    cx, cy = np.float32(p[CX] - pixels.origin[0]), np.float32(p[CY] - pixels.origin[1])
+    per_scale = np.float32(1 / scale)
     for k in range(np.uint64(size)):
         block[X * BLOCK + k] = (u[at + k] - cx) * per_scale
         block[Y * BLOCK + k] = (v[at + k] - cy) * per_scale
@@ -136,7 +142,7 @@ def load_block(block: Single, table: Float, first: int, count: int, p: Float, sc
 
 
 @compiled
-def _keep_residuals(block: Single, size: int, table: Float, first: int) -> None:
+def _keep_residuals(block: Single, size: int, table: Single, first: int) -> None:
     """Write what the model says about a block's pixels into the table."""
     residual, rise, at = table[RESIDUAL], table[RISE], np.uint64(first)
     for k in range(np.uint64(size)):
@@ -238,21 +244,23 @@ def _add_right(rows: Single, i: int, size: int, right: Float) -> None:
 
 @compiled
 def _level_equations(
-    table: Float, count: int, p: Float, scale: float, noise: Variance, normal: Float, right: Float, first: int
+    pixels: Pixels, region: int, p: Float, scale: float, noise: Variance, normal: Float, right: Float, first: int
 ) -> tuple[float, float]:
-    """Add pixels that see only the plane whose parameters begin at `first`."""
-    per_scale = 1 / scale
-    n, sx, sy, sxx, sxy, syy, e, ex, ey = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    squares, weights = 0.0, 0.0
-    for k in range(count):
-        x, y = (table[U, k] - p[CX]) * per_scale, (table[V, k] - p[CY]) * per_scale
-        model = p[first] + p[first + 1] * x + p[first + 2] * y
-        weight = 1 / (noise[0] + noise[1] * max(model, 0.0))
-        difference = table[VALUE, k] - model
-        table[RESIDUAL, k] = difference * math.sqrt(weight)
-        weight *= table[SHARE, k]
-        squares += weight * difference * difference
-        weights += table[SHARE, k]
+    """Add the pixels of a region that sees only the plane whose parameters begin at `first`."""
+    table = pixels.table[region]
+    u, v, value, share, residual = table[U], table[V], table[VALUE], table[SHARE], table[RESIDUAL]
+    cx, cy = np.float32(p[CX] - pixels.origin[0]), np.float32(p[CY] - pixels.origin[1])
+    per_scale, floor, gain = np.float32(1 / scale), np.float32(noise[0]), np.float32(noise[1])
+    level, slope_x, slope_y = np.float32(p[first]), np.float32(p[first + 1]), np.float32(p[first + 2])
+    n = sx = sy = sxx = sxy = syy = e = ex = ey = squares = weights = _ZERO
+    for k in range(np.uint64(pixels.counts[region])):
+        x, y = (u[k] - cx) * per_scale, (v[k] - cy) * per_scale
+        model = level + slope_x * x + slope_y * y
+        weight = _ONE / (floor + gain * max(model, _ZERO))
+        difference = value[k] - model
+        residual[k] = difference * math.sqrt(weight)
+        weight *= share[k]
+        squares, weights = squares + weight * difference * difference, weights + share[k]
         n, sx, sy = n + weight, sx + weight * x, sy + weight * y
         sxx, sxy, syy = sxx + weight * x * x, sxy + weight * x * y, syy + weight * y * y
         weight *= difference
@@ -266,4 +274,4 @@ def _level_equations(
     right[first] += e
     right[first + 1] += ex
     right[first + 2] += ey
-    return squares, weights
+    return float(squares), float(weights)

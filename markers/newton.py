@@ -31,13 +31,18 @@ from markers.sectors import SECTORS, Bools, all_kept, number_of, set_aside
 
 LEAST_BAND_PX = 3.5
 CORE_SIGMA = 5.0
-"""The blurs from the outline within which a pixel helps to locate it; the density is 1e-5 of its maximum beyond."""
+"""The blurs from the outline within which a pixel helps to locate it; the density is 1e-4 of its maximum beyond."""
 _BAND_TOLERANCE = 0.05
 _MOVE_TOLERANCE_SIGMA = 0.25
 _SLOPES_FROM_PX = 6.0
 """Below this radius a plane and the edge cannot be separated: ground and disc are then constant."""
 _PIXELS_PER_PARAMETER = 5
 _FAR_PX = 1.0
+_NEAR_PX, _NEAR_GAIN = 0.02, 50.0
+"""After a step not longer, and with no more gain in variances of a pixel, J'WJ is what it was, to 1 %: chance moves the
+parameters by as much from one frame to the next."""
+_SHORT_PX, _SHORT_GAIN = 2e-4, 0.02
+"""Only so short a step is the last one with a J'WJ from before."""
 _CONVERGED_PX = 2e-3
 _GREATEST_STEP_PX = 3.0
 _GREATEST_BEND = 0.3
@@ -107,11 +112,12 @@ def settle(
         set_start_levels(pixels, p, scale)
     fixed = mean_radius(p, scale) < _SLOPES_FROM_PX
     free = PARAMETERS - 4 * fixed
+    is_near = False
     for _ in range(_STEPS):
-        squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right)
+        squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right, is_near)
         if weights < _PIXELS_PER_PARAMETER * free:
             return Outcome(TOO_FEW, math.nan, gathered.seen, gathered.burnt, gathered.cut)
-        add_belief(work, p, belief)
+        add_belief(work, p, belief, is_near)
         if fixed:
             hold_slopes(work)
         variance = squares / (weights - free)
@@ -120,15 +126,23 @@ def settle(
             p[i] += step[i]
         if not possible(p, noise) or strayed(start, p, scale, 1.5):
             return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
-        far = math.hypot(step[CX], step[CY]) > _FAR_PX
+        length, gained = math.hypot(step[CX], step[CY]), gain(work, step)
+        far = length > _FAR_PX
+        is_last = length < _CONVERGED_PX and gained < variance
+        if is_near:
+            is_last = length < _SHORT_PX and gained < _SHORT_GAIN * variance
+        is_near = not is_near and length < _NEAR_PX and gained < _NEAR_GAIN * variance
+        if is_near:
+            sharpen(work, (p[SIGMA] - step[SIGMA]) / p[SIGMA])
         if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale, band_sigma):
             gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
             gathered_at = p.copy()
             gatherings += 1
+            is_near = False
             if gathered.seen < 0:
                 return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         # g'd is what the step gains: less than a pixel's share once all twelve have settled.
-        elif math.hypot(step[CX], step[CY]) < _CONVERGED_PX and gain(work, step) < variance:
+        elif is_last:
             break
     if strayed(start, p, scale, 1.0):
         return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
@@ -147,10 +161,11 @@ def look(
 
 
 @compiled
-def add_belief(work: Work, p: Float, belief: Belief) -> None:
+def add_belief(work: Work, p: Float, belief: Belief, is_in_normal: bool) -> None:
     """Pull the shape and the blur to what they are believed to be."""
     for i in range(4):
-        work.normal[M11 + i, M11 + i] += belief.weight[i]
+        if not is_in_normal:
+            work.normal[M11 + i, M11 + i] += belief.weight[i]
         work.right[M11 + i] += belief.weight[i] * (belief.mean[i] - p[M11 + i])
 
 
@@ -182,15 +197,24 @@ def set_start_levels(pixels: Pixels, p: Float, scale: float) -> None:
     """Set the levels to the means on either side of the outline."""
     sums, counts = np.zeros(2), np.zeros(2)
     counts[:] = 1e-12
+    cx, cy = p[CX] - pixels.origin[0], p[CY] - pixels.origin[1]
     for region in range(3):
         table = pixels.table[region]
         for slot in range(pixels.counts[region]):
-            x, y = (table[U, slot] - p[CX]) / scale, (table[V, slot] - p[CY]) / scale
+            x, y = (table[U, slot] - cx) / scale, (table[V, slot] - cy) / scale
             side = 1 if p[M11] * x * x + 2 * p[M12] * x * y + p[M22] * y * y > 1 else 0
             sums[side] += table[SHARE, slot] * table[VALUE, slot]
             counts[side] += table[SHARE, slot]
     p[B0:] = 0
     p[F0], p[B0] = sums[0] / counts[0], sums[1] / counts[1]
+
+
+@compiled
+def sharpen(work: Work, ratio: float) -> None:
+    """Make J'WJ that of a blur so many times smaller: what is known of the outline goes with the edge's steepness."""
+    for i in range(SIGMA + 1):
+        for j in range(SIGMA + 1):
+            work.normal[i, j] *= ratio
 
 
 @compiled

@@ -17,24 +17,31 @@ from markers.noise import Image
 
 Float = NDArray[np.float64]
 Columns = NDArray[np.int64]
+Single = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 """An image (height, width, 1 or 2 bytes of a pixel, the low one first)."""
 
 CORE, GROUND, DISC = range(3)
 U, V, VALUE, SHARE, RESIDUAL, RISE = range(6)
-"""Rows of `Pixels.table`: column and row in the image, px; value, DN; weight, 1 unless a refit doubts the pixel; then
-what the model writes: residual over its standard deviation, and how it changes per px that the outline moves."""
+"""Rows of `Pixels.table`: column and row in the image, px from the origin; value, DN; weight, 1 unless a refit doubts
+the pixel; then what the model writes: residual over its standard deviation, and how it changes per px that the outline
+moves."""
 
 CLIPPED_PART = 0.25
-_PARTS = np.array([GROUND, CORE, CORE, DISC, -1, DISC, CORE, CORE, GROUND])
+_ROWS = 6
+_PARTS = np.array([GROUND, CORE, DISC, -1, DISC, CORE, GROUND])
 """The regions that a row goes through, from left to right; -1 is within all of them."""
+_AT_ONCE = 8
+"""Pixels of a row are copied so many at a time, some beyond the end of a run, which the next run is written over."""
 
 
 class Pixels(NamedTuple):
-    """table: (3 regions, 6 rows, capacity). counts: (3,) pixels in each region."""
+    """table: (3 regions, 6 rows, room). counts: (3,) pixels in each region. origin: (2,) column and row that places are
+    relative to, near the marker's centre: single numbers hold no fractions of thousands."""
 
-    table: NDArray[np.float64]
+    table: Single
     counts: NDArray[np.int64]
+    origin: NDArray[np.int64]
 
 
 class Limits(NamedTuple):
@@ -66,7 +73,7 @@ def bytes_of(image: Image) -> Bytes:
 
 def empty_pixels(capacity: int) -> Pixels:
     """Room for `capacity` pixels in each region."""
-    return Pixels(np.empty((3, 6, capacity)), np.zeros(3, np.int64))
+    return Pixels(np.empty((3, _ROWS, capacity + _AT_ONCE), np.float32), np.zeros(3, np.int64), np.zeros(2, np.int64))
 
 
 @compiled
@@ -78,11 +85,12 @@ def gather(
     Saturated ones get the share 0 (glare), unless they are a quarter of the ground or of the disc: then the picture
     is overexposed, and clipping shifts the outline but not the centre.
     """
-    height, width, _ = image.shape
+    height, width, size = image.shape
+    room, table = pixels.table.shape[2], pixels.table.reshape(pixels.table.size)
     count = pixels.counts
     count[:] = 0
-    seen, cut = 0, False
-    burnt, side = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    seen, cut, flat = 0, False, image.reshape(image.size)
+    pixels.origin[0], pixels.origin[1] = round(centre[0]), round(centre[1])
     reach = limits.ground * scale * math.sqrt(shape[0] / (shape[0] * shape[2] - shape[1] * shape[1]))
     ends = np.empty(len(_PARTS) + 1, np.int64)
     for row in range(math.ceil(centre[1] - reach), math.floor(centre[1] + reach) + 1):
@@ -95,17 +103,19 @@ def gather(
             begin, end, region = max(ends[part], 0), min(ends[part + 1], width), _PARTS[part]
             if begin >= end or region < 0:
                 continue
-            if count[region] + end - begin > pixels.table.shape[2]:
+            if count[region] + end - begin + _AT_ONCE > pixels.table.shape[2]:
                 return Gathered(-1, -1, cut)
-            outside = 1 if part < 2 or part > 6 else 0
             seen += end - begin
-            side[outside] += end - begin
-            burnt[outside] += _copy_run(image, row, begin, end, ceiling, pixels.table[region], int(count[region]))
+            first, slot = (row * width + begin) * size, region * _ROWS * room + count[region]
+            x, y = begin - pixels.origin[0], row - pixels.origin[1]
+            _copy_run(flat, first, size, end - begin, x, y, table, slot, room)
             count[region] += end - begin
-    if burnt[0] + burnt[1] > 0:
-        clipped = burnt[0] > CLIPPED_PART * side[0], burnt[1] > CLIPPED_PART * side[1]
-        _set_burnt_aside(pixels, centre, shape, scale, ceiling, clipped)
-    return Gathered(seen, burnt[0] + burnt[1], cut)
+    burnt = 0
+    for region in range(3):
+        burnt += _share_all(pixels.table[region], int(count[region]), np.float32(ceiling))
+    if burnt > 0:
+        _set_burnt_aside(pixels, centre, shape, scale, ceiling)
+    return Gathered(seen, burnt, cut)
 
 
 @compiled
@@ -113,7 +123,7 @@ def _set_ends(ends: Columns, cx: float, shape: Float, scale: float, y: float, li
     """Where the parts of a row at height y begin, and the last one ends: into the ellipses, one inside the other, and
     out of them again. A part is empty where the row misses its ellipse."""
     begin, end = -(1 << 40), 1 << 40
-    for i, F in enumerate((limits.ground, limits.core_out, 1.0, limits.core_in, limits.disc)):
+    for i, F in enumerate((limits.ground, limits.core_out, limits.core_in, limits.disc)):
         first, last = _columns(cx, shape, scale, y, F)
         if first > last:
             first, last = end, end
@@ -122,20 +132,39 @@ def _set_ends(ends: Columns, cx: float, shape: Float, scale: float, y: float, li
 
 
 @compiled
-def _copy_run(image: Bytes, row: int, begin: int, end: int, ceiling: int, table: Float, slot: int) -> int:
-    """Write the pixels of a row into the table from `slot` on; how many of them are saturated."""
-    burnt, two_bytes, at = 0, image.shape[2] == 2, np.uint64(slot)
-    for column in range(np.uint64(begin), np.uint64(end)):  # unsigned: an index that may be negative is looked at twice
-        value = np.int64(image[row, column, 0])
-        if two_bytes:
-            value |= np.int64(image[row, column, 1]) << 8
-        table[U, at] = column
-        table[V, at] = row
-        table[VALUE, at] = value
-        table[SHARE, at] = 1.0
-        at += np.uint64(1)
-        burnt += value >= ceiling
-    return int(burnt)
+def _copy_run(
+    flat: Bytes, first: int, size: int, length: int, x: float, y: float, table: Single, slot: int, room: int
+) -> None:
+    """Write `length` pixels of a row, whose first byte is `first` of `flat`, into the table from `slot` on, and up to 7
+    more behind them.
+
+    Both are one long row: slices of tables would be counted as in use, and released, for every run.
+    """
+    whole = (length + _AT_ONCE - 1) // _AT_ONCE * _AT_ONCE
+    count = np.uint64(min(whole, (len(flat) - first) // size))  # unsigned: not looked at for being negative
+    u, v, values = np.uint64(slot + U * room), np.uint64(slot + V * room), np.uint64(slot + VALUE * room)
+    byte, column, row = np.uint64(first), np.float32(x), np.float32(y)
+    for k in range(count):
+        table[u + k] = column + np.float32(np.int32(k))
+    for k in range(count):
+        table[v + k] = row
+    if size == 1:
+        for k in range(count):
+            table[values + k] = np.float32(np.int32(flat[byte + k]))
+    else:
+        for k in range(count):
+            low, high = np.int32(flat[byte + k + k]), np.int32(flat[byte + k + k + np.uint64(1)])
+            table[values + k] = np.float32(low | high << np.int32(8))
+
+
+@compiled
+def _share_all(table: Single, count: int, ceiling: np.float32) -> int:
+    """Give all pixels of a region the share 1; how many of them are saturated."""
+    burnt = 0
+    for slot in range(np.uint64(count)):
+        table[SHARE, slot] = np.float32(1)
+        burnt += table[VALUE, slot] >= ceiling
+    return burnt
 
 
 @compiled
@@ -150,14 +179,19 @@ def _columns(cx: float, shape: Float, scale: float, y: float, F: float) -> tuple
 
 
 @compiled
-def _set_burnt_aside(
-    pixels: Pixels, centre: Float, shape: Float, scale: float, ceiling: int, clipped: tuple[bool, bool]
-) -> None:
-    """Give saturated pixels the share 0, but for those on a side of the outline that is `clipped`."""
-    for region in range(3):
-        table = pixels.table[region]
-        for slot in range(pixels.counts[region]):
-            x, y = (table[U, slot] - centre[0]) / scale, (table[V, slot] - centre[1]) / scale
-            outside = 1 if shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y > 1 else 0
-            if table[VALUE, slot] >= ceiling and not clipped[outside]:
-                table[SHARE, slot] = 0.0
+def _set_burnt_aside(pixels: Pixels, centre: Float, shape: Float, scale: float, ceiling: int) -> None:
+    """Give saturated pixels the share 0, but for those on a side of the outline a quarter of which is saturated."""
+    burnt, side = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    cx, cy = centre[0] - pixels.origin[0], centre[1] - pixels.origin[1]
+    for is_counting in (True, False):
+        for region in range(3):
+            table = pixels.table[region]
+            for slot in range(pixels.counts[region]):
+                x, y = (table[U, slot] - cx) / scale, (table[V, slot] - cy) / scale
+                outside = 1 if shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y > 1 else 0
+                is_burnt = table[VALUE, slot] >= ceiling
+                if is_counting:
+                    side[outside] += 1
+                    burnt[outside] += is_burnt
+                elif is_burnt and burnt[outside] <= CLIPPED_PART * side[outside]:
+                    table[SHARE, slot] = 0.0

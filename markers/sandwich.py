@@ -57,9 +57,9 @@ _TINY, _ZERO, _ONE, _THREE = np.float32(1e-12), np.float32(0), np.float32(1), np
 
 _MOVED, _TAKEN, _SQUARE = range(3)
 """Of each cluster with weights w: the sums of w g e, of w g^2 and of w^2 g^2."""
-_X, _Y, _G, _H, _E, _PLACE, _SEEN = range(7)
-"""Rows of a block of pixels: place in the image; influences on cx and cy; residual; place in the quadrant, in clusters;
-how many rows."""
+_X, _Y, _G, _H, _E, _PLACE, _THIS, _NEXT, _SEEN = range(9)
+"""Rows of a block of pixels: place in the image; influences on cx and cy; residual; the cluster before it in the
+quadrant; its weights in that and in the next; how many rows."""
 
 
 @compiled
@@ -79,9 +79,8 @@ def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inve
     rows = np.empty((ROWS, BLOCK), np.float32)
     block = rows.ravel()
     for region, level in ((CORE, -1), (GROUND, B0), (DISC, F0)):
-        table, count = pixels.table[region], pixels.counts[region]
-        for first in range(0, count, BLOCK):
-            size = load_block(block, table, first, count, p, scale)
+        for first in range(0, pixels.counts[region], BLOCK):
+            size = load_block(block, pixels, region, first, p, scale)
             for k in range(size):
                 seen[_X, k], seen[_Y, k] = rows[X, k], rows[Y, k]
             if region == CORE:
@@ -139,18 +138,20 @@ def _add_block(seen: Single, size: int, sums: Float) -> None:
     parts = sums.shape[2] - 1
     for k in range(size):
         x, y = abs(seen[_X, k]), abs(seen[_Y, k])
-        seen[_PLACE, k] = np.float32(parts) * y / (x + y + _TINY)
+        place = np.float32(parts) * y / (x + y + _TINY)
+        cell = np.float32(np.int32(place))
+        square = (place - cell) * (place - cell) * (_THREE - (place - cell) - (place - cell))
+        seen[_PLACE, k], seen[_THIS, k], seen[_NEXT, k] = cell, math.sqrt(_ONE - square), math.sqrt(square)
     for cluster in range(parts + 1):
-        middle = np.float32(cluster)
+        middle, before = np.float32(cluster), np.float32(cluster - 1)
         gx = gy = gxx = gyy = wxx = wyy = _ZERO
         for k in range(size):
-            near = max(_ONE - abs(seen[_PLACE, k] - middle), _ZERO)
-            square = near * near * (_THREE - near - near)
-            weight = math.sqrt(square)
-            g, h, e = seen[_G, k], seen[_H, k], seen[_E, k]
-            gx, gy = gx + weight * g * e, gy + weight * h * e
-            gxx, gyy = gxx + weight * g * g, gyy + weight * h * h
-            wxx, wyy = wxx + square * g * g, wyy + square * h * h
+            cell, g, h, e = seen[_PLACE, k], seen[_G, k], seen[_H, k], seen[_E, k]
+            weight = (seen[_THIS, k] if cell == middle else _ZERO) + (seen[_NEXT, k] if cell == before else _ZERO)
+            wg, wh = weight * g, weight * h
+            gx, gy = gx + wg * e, gy + wh * e
+            gxx, gyy = gxx + wg * g, gyy + wh * h
+            wxx, wyy = wxx + wg * wg, wyy + wh * wh
         for axis, found in enumerate(((gx, gxx, wxx), (gy, gyy, wyy))):
             for row in range(3):
                 sums[axis, row, cluster] += found[row]

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from markers.edge_fit import EdgeFit, Flag, fit_edges
@@ -29,7 +30,7 @@ from markers.edge_model import (
     normal_equations,
 )
 from markers.noise import Noise
-from markers.pixels import CORE, DISC, GROUND, VALUE, Limits, U, V, bytes_of, empty_pixels, gather
+from markers.pixels import CORE, DISC, GROUND, SHARE, VALUE, Limits, Pixels, U, V, bytes_of, empty_pixels, gather
 from tests.nightly import by_night
 
 from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
@@ -101,10 +102,10 @@ def test_the_normal_equations_are_those_of_the_model():
     gather(bytes_of(image), away[:2], away[2:5], 12.0, limits, 255, pixels)
     values = [pixels.table[region, :, : pixels.counts[region]] for region in range(3)]
     for part in values:
-        part[VALUE] = model(truth, part)
+        part[VALUE] = model(truth, in_image(part, pixels))
     normal, right = np.empty((12, 12)), np.empty(12)
     squares, weights = normal_equations(pixels, away, 12.0, (1.0, 0.0), normal, right)
-    seen = np.concatenate(values, axis=1)
+    seen = in_image(np.concatenate(values, axis=1), pixels)
     residual = seen[VALUE] - model(away, seen)
     steps = 1e-5 * np.eye(12)
     slopes = np.array([(model(away + step, seen) - model(away - step, seen)) / 2e-5 for step in steps])
@@ -115,23 +116,35 @@ def test_the_normal_equations_are_those_of_the_model():
     np.testing.assert_allclose(normal / np.outer(size, size), slopes @ slopes.T / np.outer(size, size), atol=0.07)
 
 
-@pytest.mark.parametrize("centre", [(20.3, 19.8), (3.0, 38.6)])
-def test_pixels_are_gathered_by_where_they_lie_round_the_outline(centre: tuple[float, float]):
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("centre", [(20.3, 19.8), (3.0, 38.6), (39.2, 38.6)])
+def test_pixels_are_gathered_by_where_they_lie_round_the_outline(
+    centre: tuple[float, float], dtype: type[np.uint8] | type[np.uint16]
+):
     """Each once, in the region that its F says, also where the image cuts them off."""
     shape, scale, limits = np.array([1.1, 0.08, 0.9]), 9.0, Limits(0.4, 0.7, 1.3, 1.7)
     pixels = empty_pixels(41 * 41)
-    gathered = gather(bytes_of(np.zeros((41, 41), np.uint8)), np.array(centre), shape, scale, limits, 255, pixels)
+    image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (41, 41), dtype)
+    gathered = gather(bytes_of(image), np.array(centre), shape, scale, limits, np.iinfo(dtype).max, pixels)
     v, u = np.mgrid[:41, :41]
     x, y = (u - centre[0]) / scale, (v - centre[1]) / scale
     F = np.sqrt(shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y)
     region = np.select([F <= 0.4, F <= 0.7, F <= 1.3, F <= 1.7], [-1, DISC, CORE, GROUND], -1)
     for which in (CORE, GROUND, DISC):
-        found = pixels.table[which, :, : pixels.counts[which]].astype(int)
+        found = in_image(pixels.table[which, :, : pixels.counts[which]], pixels).astype(int)
+        np.testing.assert_array_equal(found[VALUE], image[found[V], found[U]])
         assert sorted(zip(found[U], found[V], strict=True)) == sorted(
             zip(u[region == which], v[region == which], strict=True)
         )
     assert gathered.seen == np.count_nonzero(region >= 0)
-    assert gathered.cut == (centre[0] < 10)
+    assert gathered.cut == (abs(centre[0] - 20) > 10)
+
+
+def in_image(part: NDArray[np.float32], pixels: Pixels) -> Float:
+    """Places in the image, and values."""
+    whole = part[:SHARE].astype(np.float64)
+    whole[[U, V]] += pixels.origin[:, None]
+    return whole
 
 
 def model(p: Float, pixels: Float) -> Float:
