@@ -10,6 +10,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from struct import Struct
 
 import deflate
 import zstandard
@@ -35,6 +36,8 @@ from mcap.writer import LIBRARY_IDENTIFIER, MCAP0_MAGIC, CompressionType
 
 from recording.format.mcap_bytes import CHUNK, CRC, LENGTH, MESSAGE, RECORD, bytes_of
 
+_MESSAGE = int(Opcode.MESSAGE)
+_MESSAGE_HEAD = Struct("<BQHIQQ")  # as RECORD and MESSAGE
 _COMPRESSION_NAMES = {CompressionType.NONE: "", CompressionType.ZSTD: "zstd"}
 
 
@@ -47,10 +50,6 @@ class _Chunk:
     first_ns: int = 0
     last_ns: int = 0
     places: dict[int, list[tuple[int, int]]] = field(default_factory=dict[int, list[tuple[int, int]]])
-
-    def add(self, part: bytes) -> None:
-        self.parts.append(part)
-        self.size_bytes += len(part)
 
     def note(self, channel: int, time_ns: int) -> None:
         """A message that begins here."""
@@ -125,8 +124,8 @@ class McapWriter:
         self._last_ns = max(self._last_ns, log_time_ns)
         self._counts[channel] += 1
         self._chunk.note(channel, log_time_ns)
-        head = RECORD.pack(Opcode.MESSAGE, MESSAGE.size + len(data))
-        self._add(head + MESSAGE.pack(channel, sequence, log_time_ns, publish_time_ns), data)
+        length = MESSAGE.size + len(data)
+        self._add(_MESSAGE_HEAD.pack(_MESSAGE, length, channel, sequence, log_time_ns, publish_time_ns), data)
 
     def end_chunk(self) -> None:
         """What was added so far is in whole chunks."""
@@ -134,11 +133,13 @@ class McapWriter:
         if not chunk.places:
             return
         self._chunk = _Chunk()
-        crc = 0
-        for part in chunk.parts:
-            crc = deflate.crc32(part, crc)
         name = _COMPRESSION_NAMES[self._compression]
-        parts = [zstandard.compress(b"".join(chunk.parts))] if name else chunk.parts
+        parts = [b"".join(chunk.parts)] if name else chunk.parts
+        crc = 0
+        for part in parts:
+            crc = deflate.crc32(part, crc)
+        if name:
+            parts = [zstandard.compress(parts[0])]
         stored_bytes = sum(map(len, parts))
         head = CHUNK.pack(chunk.first_ns, chunk.last_ns, chunk.size_bytes, crc, len(name)) + name.encode()
         head += LENGTH.pack(stored_bytes)
@@ -201,9 +202,10 @@ class McapWriter:
         ]
 
     def _add(self, *parts: bytes) -> None:
-        for part in parts:
-            self._chunk.add(part)
-        if self._chunk.size_bytes > self._chunk_bytes:
+        chunk = self._chunk
+        chunk.parts += parts
+        chunk.size_bytes += sum(map(len, parts))
+        if chunk.size_bytes > self._chunk_bytes:
             self.end_chunk()
 
     def _write(self, *parts: bytes) -> tuple[int, int]:

@@ -24,11 +24,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from google.protobuf.message import Message
-from mcap.records import Attachment, Channel, DataEnd, McapRecord, Metadata, Schema
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import CompressionType
+from mcap.writer import MCAP0_MAGIC, CompressionType
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from foundation.files import sync_folder
@@ -42,6 +41,7 @@ from recording.format.layout import (
     UNFINISHED,
     segment_metadata,
 )
+from recording.format.mcap_bytes import MESSAGE, RECORD, check_attachment, chunk_content, records, stream
 from recording.writing.mcap_writer import McapWriter
 from recording.writing.notices import disk_space
 
@@ -289,32 +289,41 @@ def merge_chunks(source: Path, target: Path, compression: CompressionType) -> No
 
 def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> None:
     writer = McapWriter(compression, CHUNK_BYTES)
+    size_bytes = source.stat().st_size
     with source.open("rb") as file:
-        for record in StreamReader(file, validate_crcs=True, record_size_limit=source.stat().st_size).records:
-            if isinstance(record, DataEnd):  # behind it is the index
-                break
-            _add(writer, record)
+        file.seek(len(MCAP0_MAGIC))
+        opcode = 0
+        while opcode != Opcode.DATA_END:  # behind it is the index
+            opcode, length = RECORD.unpack(file.read(RECORD.size))
+            if length > size_bytes:
+                raise ValueError("a record is longer than the file")
+            _add(writer, opcode, memoryview(file.read(length)))
             if parts := writer.take():
                 sink.append(parts)
     writer.finish()
     sink.append(writer.take())
 
 
-def _add(writer: McapWriter, record: McapRecord) -> None:
+def _add(writer: McapWriter, opcode: int, content: memoryview) -> None:
     """One record of the source; schemas and channels get the numbers they had, because their order is the same."""
-    match record:
-        case McapMessage(channel_id=channel, log_time=log_ns, publish_time=publish_ns, sequence=sequence, data=data):
-            writer.add_message(channel, log_ns, publish_ns, sequence, data)
-        case Channel():
-            writer.add_channel(record.topic, record.message_encoding, record.schema_id, record.metadata)
-        case Schema():
-            writer.add_schema(record.name, record.encoding, record.data)
-        case Metadata():
-            writer.add_metadata(record.name, record.metadata)
-        case Attachment():
-            writer.add_attachment(record)
-        case _:  # the header is the writer's own, and so are the message indexes
-            pass
+    if opcode == Opcode.MESSAGE:
+        channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(content)
+        writer.add_message(channel, log_time_ns, publish_time_ns, sequence, bytes(content[MESSAGE.size :]))
+    elif opcode == Opcode.CHUNK:
+        for each in records(chunk_content(content)[1]):
+            _add(writer, *each)
+    elif opcode == Opcode.CHANNEL:
+        channel = Channel.read(stream(content))
+        writer.add_channel(channel.topic, channel.message_encoding, channel.schema_id, channel.metadata)
+    elif opcode == Opcode.SCHEMA:
+        schema = Schema.read(stream(content))
+        writer.add_schema(schema.name, schema.encoding, schema.data)
+    elif opcode == Opcode.METADATA:
+        metadata = Metadata.read(stream(content))
+        writer.add_metadata(metadata.name, metadata.metadata)
+    elif opcode == Opcode.ATTACHMENT:
+        check_attachment(bytes(content))
+        writer.add_attachment(Attachment.read(stream(content)))
 
 
 def _reserve(fd: int, size_bytes: int) -> None:
