@@ -62,6 +62,7 @@ def first_decision(
         warmest_degC=max(set_points_degC),
         dwells_s=tuple(sorted(known.dwells_s)),
         ramp_K_per_min=known.ramp_K_per_min,
+        states=known.states,
         left_s=0.0,
         visits=0,
         wait_s=known.wait_s,

@@ -7,6 +7,8 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from experiments.steps import WANTED_STATES, WantedState
+
 COLDEST_degC, WARMEST_degC = -10.0, 70.0  # the paper's chamber, section 2
 _SHORTEST_DWELL_s = 60.0
 Chamber_degC = Annotated[float, Field(ge=COLDEST_degC, le=WARMEST_degC)]
@@ -61,7 +63,8 @@ class Settled(BaseModel):
 class Known(BaseModel):
     """Experimental: when enough is known of a camera, and within what the night decides; see steps.Decide.
 
-    wait_s: for a decision, in real time.
+    states: those in which the model is wanted, throughout the range of the set-points: of a camera at rest, 4 h after a
+    change, or on the way, 45 min after it. wait_s: for a decision, in real time.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -69,6 +72,7 @@ class Known(BaseModel):
     residual_px: float = Field(default=0.005, gt=0, le=10)
     dwells_s: tuple[Wait_s, ...] = Field(default=(900.0, 1500.0, 2700.0), min_length=1, max_length=5)
     ramp_K_per_min: float = Field(default=2.0, gt=0, le=20)
+    states: tuple[WantedState, ...] = Field(default=WANTED_STATES, min_length=1, max_length=2)
     wait_s: float = Field(default=120.0, ge=5, le=3600)
 
     @model_validator(mode="after")

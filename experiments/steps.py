@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
-from typing import get_args
+from typing import Literal, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -150,13 +150,18 @@ class Prompt:
     text: str
 
 
+WantedState = Literal["at_rest", "on_the_way"]
+WANTED_STATES: tuple[WantedState, ...] = ("at_rest",)
+
+
 @dataclass(frozen=True, slots=True)
 class Decide:
     """Ask what to visit next, or whether enough is known: the answer replaces what is left of its cycle, which are
     visits of `set_points_degC` for `dwell_s` each (experiments/known.py).
 
-    Wanted is a predicted residual of `residual_px` from `coldest_degC` to `warmest_degC`. No temperature outside is
-    visited, none of `held_out_degC` is shown to the fitter; of these `unvalidated_degC` have not been visited yet.
+    Wanted is a predicted residual of `residual_px` from `coldest_degC` to `warmest_degC`, over `states`: of a camera
+    `at_rest`, 4 h after a change, or `on_the_way`, 45 min after it. No temperature outside is visited, none of
+    `held_out_degC` is shown to the fitter; of these `unvalidated_degC` have not been visited yet.
     `dwells_s`: to choose from. `ramp_K_per_min`: of the chamber, at most. `left_s`: of the fixed cycle's time.
     `visits`: that were decided so far. `wait_s`: for an answer, in real time; without one the fixed visits go on.
     `frames`, `interval_s`, `exposure_s`: of a visit.
@@ -177,6 +182,7 @@ class Decide:
     set_points_degC: tuple[float, ...] = ()
     held_out_degC: tuple[float, ...] = ()
     unvalidated_degC: tuple[float, ...] = ()
+    states: tuple[WantedState, ...] = WANTED_STATES
 
 
 Step = (

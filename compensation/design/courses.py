@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from compensation.design.forecast import Situation, Surroundings, after
 from compensation.history.states import Float
 
-_HORIZON_S = 4 * 3600.0
-_COURSES = 300
-_THIRDS = 3
+_HORIZON_S = 8 * 3600.0
+_DRAWN = 40
+"""Courses of each kind, drawn from the whole grid and from each of its thirds."""
+_THIRDS, _EVERY = 3, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +40,8 @@ class Course:
 def best_course(
     known: Known, here: Situation, around: Surroundings, grid_degC: Float, dwells_s: Sequence[float], seed: int
 ) -> Course:
-    """Of courses drawn from the grid, over its whole range and within each of its thirds, and of each dwell, about as
-    long together: the one after which the mean variance over the wanted states is least. The same for a seed."""
+    """Of courses of each dwell, about as long together: the one after which the mean variance over the wanted states is
+    least. The same for a seed."""
     rng = np.random.default_rng([20, seed])
     moment = known.wanted.T @ known.wanted / len(known.wanted)
     best: Course | None = None
@@ -72,6 +74,14 @@ def _after_courses(
 
 
 def _drawn(grid_degC: Float, visits: int, rng: np.random.Generator) -> Float:
-    """(S, visits)."""
+    """(S, visits): to and fro, steadily up or down, staying at one temperature, and at one after the other. What creeps
+    for hours shows in those that stay or go one way, which are hardly ever drawn by chance."""
     parts = [grid_degC, *(third for third in np.array_split(grid_degC, _THIRDS) if len(third))]
-    return np.concatenate([rng.choice(part, (_COURSES // len(parts), visits)) for part in parts])
+    to_and_fro = [rng.choice(part, (_DRAWN, visits)) for part in parts]
+    up = [np.sort(rng.choice(part, (_DRAWN // 2, visits)), axis=1) for part in parts]
+    down = [np.sort(rng.choice(part, (_DRAWN // 2, visits)), axis=1)[:, ::-1] for part in parts]
+    staying = np.repeat(grid_degC[:, None], visits, axis=1)
+    pairs = np.array(list(product(grid_degC[::_EVERY], repeat=2)))
+    first = visits // 2
+    both = np.hstack([np.repeat(pairs[:, :1], first, axis=1), np.repeat(pairs[:, 1:], visits - first, axis=1)])
+    return np.concatenate([*to_and_fro, *up, *down, staying, both])

@@ -7,6 +7,7 @@ the night so far. Lags and plays are those of compensation/drift_runtime.py.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,6 +59,13 @@ class Situation:
     def where(self, rows: NDArray[np.int64]) -> Situation:
         """These situations, in this order."""
         return Situation(self.target_degC[rows], self.air_degC[rows], self.camera_lags[rows], self.states.where(rows))
+
+
+def together(parts: Sequence[Situation]) -> Situation:
+    """The situations of all these, which remember the same; ValueError for none."""
+    columns = [(part.target_degC, part.air_degC, part.camera_lags, part.states.rows) for part in parts]
+    target, air, lags, rows = (np.concatenate(each) for each in zip(*columns, strict=True))
+    return Situation(target, air, lags, States.from_rows(parts[0].states.memory, rows))
 
 
 def surroundings(observations: Observations, ramp_K_per_min: float) -> Surroundings:

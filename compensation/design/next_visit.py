@@ -10,46 +10,48 @@ Pure: what was observed goes in, a decision comes out, the same for the same obs
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from compensation.design.courses import Known, best_course
-from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
+from compensation.design.forecast import Situation, now, surroundings
+from compensation.design.wanted_states import wanted_states
+from compensation.drift.candidates import FEWEST_BETWEEN
 from compensation.drift.terms import Origin, features
 from compensation.drift.thermal_learning import fit_thermal
 from compensation.drift.thermal_model import ThermalModel
 from compensation.history.states import Float
 from compensation.observations import Observations
-from experiments.steps import Role
+from experiments.steps import WANTED_STATES, Role, WantedState
 from foundation.errors import SessionError
 
-_GRID, _PLACES = 13, 7
+_GRID = 13
 _APART_K = 1.0
 """From a held-out temperature: nearer ones would show it to the fitter."""
-
-_ARRIVED_S = 2700.0
+_UNCHECKED = "what the model leaves between set-points is seen at three of them"
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
     """What a night is for, and within what it decides. range_degC: set-points at which the model is wanted; none
     outside is chosen, nor one of held_out_degC. residual_px: the predicted residual with which the night is content.
-    dwells_s: to choose from. ramp_K_per_min: of the chamber, at most."""
+    dwells_s: to choose from. ramp_K_per_min: of the chamber, at most. states: in which the model is wanted there, see
+    wanted_states.py."""
 
     range_degC: tuple[float, float]
     residual_px: float
     held_out_degC: tuple[float, ...] = ()
     dwells_s: tuple[float, ...] = (900.0, 1500.0, 2700.0)
     ramp_K_per_min: float = 2.0
+    states: tuple[WantedState, ...] = WANTED_STATES
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
     """kind: "visit" or "enough". chamber_degC, dwell_s: of the visit. predicted_px: the residual that the model
-    predicts over the wanted states, RMS of a coordinate, NaN without a model. reason: in words."""
+    predicts over the wanted states, RMS of a coordinate, NaN where that was not asked. reason: in words."""
 
     kind: Literal["visit", "enough"]
     chamber_degC: float
@@ -65,12 +67,14 @@ def decide(observations: Observations, wanted: Wanted) -> Decision:
         model = fit_thermal(observations)
         around = surroundings(observations, wanted.ramp_K_per_min)
     except SessionError as error:
-        return _furthest(observations, wanted, grid, str(error))
-    asked = _asked(around, model, wanted)
+        return _furthest(observations, wanted, grid, f"no model yet ({error})")
+    asked = wanted_states(around, model.memory, wanted.range_degC, wanted.states)
     predicted_px = predicted_residual_px(model, asked)
     if predicted_px <= wanted.residual_px:
         reason = f"the residual is predicted at {1e3 * predicted_px:.1f} mpx, {1e3 * wanted.residual_px:g} are wanted"
         return Decision("enough", math.nan, 0.0, predicted_px, reason)
+    if _few_between(observations) and _without_discrepancy_px(model, asked) <= wanted.residual_px:
+        return _furthest(observations, wanted, grid, _UNCHECKED)
     known = Known(
         model.leverage_matrix,
         float(model.discrepancy_px @ model.discrepancy_px),
@@ -104,24 +108,25 @@ def _grid(wanted: Wanted) -> Float:
     return np.round(grid[near >= _APART_K] if (near >= _APART_K).any() else grid[[0, -1]], 1)
 
 
+def _few_between(observations: Observations) -> bool:
+    """Whether too few set-points lie between others for what the model leaves at such ones."""
+    return len(_seen_degC(observations)) - 2 < FEWEST_BETWEEN
+
+
+def _without_discrepancy_px(model: ThermalModel, asked: Situation) -> float:
+    return predicted_residual_px(replace(model, discrepancy_px=np.zeros(2)), asked)
+
+
+def _seen_degC(observations: Observations) -> Float:
+    """The set-points that a fit knows, each once."""
+    return np.unique(observations.chamber_degC[observations.of(Role.REFERENCE, Role.FIT)])
+
+
 def _furthest(observations: Observations, wanted: Wanted, grid: Float, why: str) -> Decision:
-    seen = observations.chamber_degC[observations.of(Role.REFERENCE, Role.FIT)]
+    seen = _seen_degC(observations)
     distance_K = np.abs(grid[:, None] - seen).min(axis=1, initial=np.inf)
     degC, dwell_s = float(grid[np.argmax(distance_K)]), max(wanted.dwells_s)
-    return Decision(
-        "visit", degC, dwell_s, math.nan, f"no model yet ({why}); {degC:g} degC is furthest from the others"
-    )
-
-
-def _asked(around: Surroundings, model: ThermalModel, wanted: Wanted) -> Situation:
-    """Where the model is wanted: throughout the range, 45 min after a camera at rest in its middle, or half way to
-    either end, was brought there."""
-    low, high = wanted.range_degC
-    places = np.linspace(low, high, _PLACES)
-    begins = np.linspace(low, high, 5)[1:4]
-    pairs = np.array(list(product(begins, places)))
-    begun = at_rest(around, pairs[:, 0], model.memory)
-    return after(around, begun, pairs[:, 1], np.full(len(pairs), _ARRIVED_S))
+    return Decision("visit", degC, dwell_s, math.nan, f"{why}; {degC:g} degC is furthest from the others")
 
 
 def _features(model: ThermalModel, situation: Situation) -> Float:

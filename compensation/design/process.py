@@ -21,6 +21,7 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
 
     from compensation.design.next_visit import Wanted, decide
     from compensation.design.unfinished_night import recorded_so_far
+    from experiments.steps import WANTED_STATES
 
     cv2.setNumThreads(1)
     wanted = Wanted(
@@ -29,6 +30,7 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
         tuple(asked.get("held_out_degC", ())),
         tuple(asked["dwells_s"]),
         asked["ramp_K_per_min"],
+        tuple(asked.get("states", WANTED_STATES)),
     )
     try:
         found = decide(recorded_so_far(Path(session)), wanted)

@@ -13,7 +13,7 @@ from foundation.documents import Document
 
 Pair = tuple[float, float]
 
-_FEWEST_BETWEEN = 3
+FEWEST_BETWEEN = 3
 NO_MATTER_PX = 0.0005
 """Worse by less than anybody measures."""
 
@@ -68,7 +68,7 @@ def between(chamber_degC: Float) -> NDArray[np.bool_]:
     do: such folds say little of how well it predicts where it may be used.
     """
     inner = (chamber_degC > chamber_degC.min()) & (chamber_degC < chamber_degC.max())
-    return inner if len(np.unique(chamber_degC[inner])) >= _FEWEST_BETWEEN else np.ones(len(chamber_degC), bool)
+    return inner if len(np.unique(chamber_degC[inner])) >= FEWEST_BETWEEN else np.ones(len(chamber_degC), bool)
 
 
 def discrepancy_px(rows: Displacements, held_out: Float) -> Float:

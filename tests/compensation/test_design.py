@@ -8,6 +8,7 @@ import pytest
 from compensation.design.courses import Known, best_course
 from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
 from compensation.design.next_visit import Wanted, decide
+from compensation.design.wanted_states import wanted_states
 from compensation.drift.training import frame_states
 from compensation.history.states import Float, Memory
 from compensation.observations import Observations
@@ -70,6 +71,34 @@ def test_the_ends_of_the_range_teach_most_about_a_straight_line():
     assert chosen.variance_px2 < 1e-8 + 1e-4 / 20
 
 
+def test_a_part_that_creeps_is_shown_by_staying():
+    """At the end of eight hours at one end of the range it has gone further than on any way to and fro."""
+    around = Surroundings(np.array([0.0, 1.0]), np.array([15.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 20.0)
+    here = at_rest(around, np.array([31.0]), Memory((20000.0,)))
+
+    def creep(situation: Situation) -> Float:
+        return (situation.states.ambient_lag_degC - 31.0) / 20.0
+
+    known = Known(np.array([[1e-4]]), 1e-4, np.array([[1.0]]), creep)
+    chosen = best_course(known, here, around, np.linspace(10.0, 52.0, 13), (7200.0,), seed=1)
+    stayed = np.cumsum([7200.0] * 4)
+    gone = [float(creep(after(around, here, np.array([52.0]), np.array([time_s])))[0, 0]) for time_s in stayed]
+    assert chosen.chamber_degC in (10.0, 52.0)
+    assert chosen.variance_px2 == pytest.approx(1 / (1e4 + sum(np.square(gone)) / 1e-4), rel=0.01)
+
+
+def test_states_at_rest_are_nearer_to_the_chamber_than_those_on_the_way(observed: Observations):
+    around = surroundings(observed, ramp_K_per_min=2.0)
+    away_K = {}
+    for kind in ("at_rest", "on_the_way"):
+        states = wanted_states(around, MEMORY, (10.0, 52.0), (kind,)).states
+        places = around.air_degC(np.tile(np.linspace(10.0, 52.0, 7), 3))
+        away_K[kind] = float(np.abs(states.ambient_lag_degC[:, 1] - places).max())
+    assert away_K["at_rest"] < 0.5 < 5.0 < away_K["on_the_way"]
+    both = wanted_states(around, MEMORY, (10.0, 52.0), ("at_rest", "on_the_way"))
+    assert len(both.air_degC) == len(both.states.camera_degC) == 42
+
+
 def test_decisions_are_the_same_for_the_same_frames_and_stay_within_what_is_wanted(observed: Observations):
     decisions = [decide(observed, WANTED) for _ in range(2)]
     assert decisions[0] == decisions[1]
@@ -83,6 +112,16 @@ def test_before_there_is_a_model_what_is_furthest_is_visited(observed: Observati
     first = decide(up_to(observed, 80), WANTED)
     assert (first.kind, first.chamber_degC) == ("visit", 52.0)
     assert np.isnan(first.predicted_px)
+
+
+def test_what_is_left_between_set_points_is_looked_at_before_the_night_goes_on(observed: Observations):
+    """After 52 and 10 degC only the reference lies between others: what a form leaves there cannot be told from how it
+    extrapolates, and more at the ends would not change that."""
+    begun = up_to(observed, 90)
+    predicted_px = decide(begun, WANTED).predicted_px
+    decision = decide(begun, replace(WANTED, residual_px=0.95 * predicted_px))
+    assert decision.reason.startswith("what the model leaves between set-points")
+    assert decision.chamber_degC == 38.0
 
 
 def test_enough_is_known_when_the_predicted_residual_is_the_wanted_one(observed: Observations):
