@@ -29,6 +29,7 @@ _ENTRIES = {"drivers.sim": "drivers.sim.__main__:main", "stand.cli": "stand.cli:
 """Of what `python -m` starts, what runs it; of other modules it is `main`."""
 _LOADED = {
     "stand.cli": ("stand.commands.run_cli", "stand.commands.serve_cli", "stand.commands.queue_cli"),
+    "tests.code": ("stand.running.run", "stand.queueing.queue_work", "stand.serving.api.server"),
     "recording.writing.disk": ("recording.writing.recorder", "stand.queueing.queue_work"),
     "stand.serving.preview_process": ("stand.serving.preview", "stand.serving.recorded_drift"),
 }

@@ -19,6 +19,7 @@ from foundation.documents import parse_document
 from foundation.errors import InUse, SessionError
 from stand.config.stand_config import StandConfig, packaged
 from stand.running.opening.claim import addresses, claimed
+from tests import forked
 from tests.addresses import move_to_free
 from tests.sections import change
 
@@ -184,7 +185,8 @@ def start(tmp_path: Path) -> Iterator[Callable[[], "subprocess.Popen[str]"]]:
     started: list[subprocess.Popen[str]] = []
 
     def begin() -> "subprocess.Popen[str]":
-        started.append(subprocess.Popen([sys.executable, "-c", HOLDER, file], stdout=subprocess.PIPE, text=True))
+        command = [sys.executable, "-m", "tests.code", HOLDER, file]
+        started.append(forked.popen(command, stdout=subprocess.PIPE, text=True))
         return started[-1]
 
     yield begin

@@ -22,6 +22,7 @@ from stand.serving.api.listening import MOST_CLIENTS
 from stand.serving.client import running_sessions, server_of
 from stand.serving.desk import RunStatus
 from stand.serving.presence import Entry, Presence, address_in, living, opened_folder
+from tests import forked
 from tests.asking import ask, ask_status
 from tests.stand.a_desk import STAND, ADesk, served
 
@@ -302,7 +303,9 @@ def daemon() -> Iterator[Callable[[Path], "subprocess.Popen[str]"]]:
     started = []
 
     def start(session: Path) -> "subprocess.Popen[str]":
-        process = subprocess.Popen([sys.executable, "-c", DAEMON, str(session)], stdout=subprocess.PIPE, text=True)
+        process = forked.popen(
+            [sys.executable, "-m", "tests.code", DAEMON, str(session)], stdout=subprocess.PIPE, text=True
+        )
         started.append(process)
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"

@@ -16,6 +16,7 @@ from foundation.errors import ConfigError, SessionError, StandTripped
 from stand.queueing import queue
 from stand.queueing.queue_file import LAST_NAME, QUEUE_NAME, State, working
 from stand.running.order import Order, load_order
+from tests import forked
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -240,10 +241,9 @@ for _ in range(20):
 
 def test_two_processes_at_once_lose_nothing(tmp_path: Path):
     with contextlib.ExitStack() as stack:
-        command = [sys.executable, "-c", ADDING, str(tmp_path)]
+        command = [sys.executable, "-m", "tests.code", ADDING, str(tmp_path)]
         processes = [
-            stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
-            for _ in range(2)
+            stack.enter_context(forked.popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)) for _ in range(2)
         ]
         for process in processes:
             assert process.stdout is not None

@@ -8,6 +8,7 @@ import os
 import pickle
 import resource
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
 from stand.simulator import ControlSocket
+from tests import forked
 from tests.system.conftest import AS_INSTALLED, SHORT_RECIPE, WHOLE_SENSOR, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
@@ -162,17 +164,16 @@ asyncio.run(run_virtual(order, out, None, watch))
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 async def test_a_dead_daemon_does_not_heat(tmp_path: Path, order: Callable[..., Order], number: signal.Signals):
     ordered = order()
-    daemon = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", DAEMON, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
-    )
+    command = [sys.executable, "-m", "tests.code", DAEMON]
+    daemon = forked.popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert daemon.stdin is not None
     assert daemon.stdout is not None
     daemon.stdin.write(pickle.dumps((ordered, tmp_path / "out")))
     daemon.stdin.close()
-    assert (await daemon.stdout.readline()).strip() == b"heating"
+    assert (await asyncio.to_thread(daemon.stdout.readline)).strip() == b"heating"
     daemon.send_signal(number)
     if number is signal.SIGKILL:
-        await daemon.wait()
+        await asyncio.to_thread(daemon.wait)
 
     simulation = ordered.config.simulation
     assert simulation is not None
@@ -195,7 +196,8 @@ async def test_a_dead_daemon_does_not_heat(tmp_path: Path, order: Callable[..., 
     await control.close()
     if number is signal.SIGSTOP:
         daemon.kill()
-        await daemon.wait()
+        await asyncio.to_thread(daemon.wait)
+    daemon.stdout.close()
 
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")

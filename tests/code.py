@@ -1,0 +1,12 @@
+"""`python -m tests.code CODE ARGUMENT ...` is as `python -c CODE ARGUMENT ...`, and may be forked (tests/forked.py)."""
+
+import sys
+
+
+def main() -> None:
+    code = sys.argv.pop(1)
+    exec(compile(code, "<code of a test>", "exec"), {"__name__": "__main__"})
+
+
+if __name__ == "__main__":
+    main()
