@@ -101,6 +101,7 @@ def test_arrays_become_observations_with_a_reference():
     assert seen.target.count == 24
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_fit_of_arrays_finds_the_drift_and_may_be_kept(tmp_path: Path):
     centres_px, camera_degC, chamber_degC = arrays()
     seen = thermostand.observations_of(

@@ -234,6 +234,7 @@ def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
     np.testing.assert_allclose([i, j], expected.mean(axis=0), atol=0.003)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving_out():
     night = observations(quadratic, 0.005, held_out_degC=())
     model = fit_paper(night, 2)
@@ -280,6 +281,7 @@ def test_what_a_session_says_of_itself_cannot_change_the_page():
     assert json.loads(as_json(numbers_of(own, None, None)))["sessions"][0]["operator"] == evil
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_that_cannot_be_written_leaves_nothing(tmp_path: Path):
     with pytest.raises(SessionError, match="cannot be written"):
         write_report(tmp_path / "none" / "report.html", warm_up_only(), None, None)
