@@ -81,7 +81,7 @@ class EdgeState:
 
 @compiled
 def normal_equations(
-    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float, is_known: bool = False
+    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float, is_known: bool
 ) -> tuple[float, float]:
     """Set J'WJ (12, 12), unless it is known well enough from parameters near by, and J'We (12,) at the parameters `p`,
     write each pixel's residual, and return the sum of squared residuals and the sum of the pixels' shares."""

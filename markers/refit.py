@@ -127,7 +127,7 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
             covariance[n], chi[n] = math.nan, math.nan
             belief = Belief(all_kept(), p[M11 : SIGMA + 1].copy(), weight[n])
             look(image, p, scale[n], band(p, scale[n], reach[n], False, band_sigma), ceiling, pixels, belief)
-            normal_equations(pixels, p, scale[n], noise, work.normal, work.right)
+            normal_equations(pixels, p, scale[n], noise, work.normal, work.right, False)
             drop_strangers(belief.kept, sector_misfits(pixels, p), greatest)
             searching = True
             while searching and number_of(belief.kept) >= _LEAST_SECTORS:

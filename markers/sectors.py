@@ -18,8 +18,6 @@ SECTORS = 36
 _QUADRANT = SECTORS // 4
 _BLOCK = 256
 """Pixels whose sectors are held at a time."""
-_SIDE_BY_SIDE = 4
-"""Neighbours are mostly in the same sector: sums that take turns need not wait for one another."""
 _PARTS, _TINY, _ONE = np.float32(_QUADRANT), np.float32(1e-12), np.float32(1)
 
 
@@ -76,24 +74,18 @@ def deviations(pixels: Pixels, p: Float) -> Float:
     """What each sector deviates from the model, in standard deviations, (3, 36): its outline (CORE), its levels
     further out and further in (GROUND, DISC). NaN where there are no pixels."""
     found, places = np.empty((3, SECTORS)), np.empty(_BLOCK, np.int32)
-    slopes, moments = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
-    sums = np.empty((_SIDE_BY_SIDE, SECTORS, 2))
+    sums = np.empty((2, SECTORS, 2))  # neighbours are mostly in one sector: they take turns, not to wait for each other
     for region in range(3):
         share, rise, residual = pixels.table[region, SHARE], pixels.table[region, RISE], pixels.table[region, RESIDUAL]
         sums[:] = 0
         for first in range(0, pixels.counts[region], _BLOCK):
-            size, at = sectors_of(pixels, region, first, p, places), np.uint64(first)
-            for k in range(np.uint64(size)):
-                slope = rise[at + k] if region == CORE else _ONE
-                slopes[k], moments[k] = share[at + k] * slope * slope, share[at + k] * slope * residual[at + k]
-            for k in range(np.uint64(size)):
-                column, place = k % np.uint64(_SIDE_BY_SIDE), np.uint64(places[k])
-                sums[column, place, 0] += moments[k]
-                sums[column, place, 1] += slopes[k]
+            for k in range(np.uint64(sectors_of(pixels, region, first, p, places))):
+                at, turn, place = np.uint64(first) + k, k & np.uint64(1), np.uint64(places[k])
+                slope = rise[at] if region == CORE else _ONE
+                sums[turn, place, 0] += share[at] * slope * residual[at]
+                sums[turn, place, 1] += share[at] * slope * slope
         for place in range(SECTORS):
-            moment = weight = 0.0
-            for column in range(_SIDE_BY_SIDE):
-                moment, weight = moment + sums[column, place, 0], weight + sums[column, place, 1]
+            moment, weight = sums[0, place, 0] + sums[1, place, 0], sums[0, place, 1] + sums[1, place, 1]
             found[region, place] = moment / math.sqrt(weight) if weight > 0 else math.nan
     return found
 

@@ -16,6 +16,7 @@ Float = NDArray[np.float64]
 Peer = Callable[[Image], Float | None]
 
 STRONGEST = "SimpleBlob, step 2"
+COMMON = "findCirclesGrid, defaults"
 _LEAST_AREA_px2 = 300
 _LEVEL_DN = 115
 
@@ -26,7 +27,7 @@ def opencv_peers(target: Target) -> dict[str, Peer]:
     35..185: 2.4)."""
     size = (target.columns, target.rows)
     return {
-        "findCirclesGrid, defaults": lambda image: _grid(image, size, cv2.SimpleBlobDetector.create()),
+        COMMON: lambda image: _grid(image, size, cv2.SimpleBlobDetector.create()),
         "findCirclesGrid, tuned": lambda image: _grid(image, size, _blobs(40, 180, 20)),
         STRONGEST: lambda image: _centres(_blobs(35, 185, 2).detect(image)),
     }

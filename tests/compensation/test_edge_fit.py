@@ -104,7 +104,7 @@ def test_the_normal_equations_are_those_of_the_model():
     for part in values:
         part[VALUE] = model(truth, in_image(part, pixels))
     normal, right = np.empty((12, 12)), np.empty(12)
-    squares, weights = normal_equations(pixels, away, 12.0, (1.0, 0.0), normal, right)
+    squares, weights = normal_equations(pixels, away, 12.0, (1.0, 0.0), normal, right, False)
     seen = in_image(np.concatenate(values, axis=1), pixels)
     residual = seen[VALUE] - model(away, seen)
     steps = 1e-5 * np.eye(12)
