@@ -50,6 +50,7 @@ def figures(directory: Path) -> list[Figure]:
         return [
             *_png(image),
             *(_of_limit("png, 8 bit", noisy(clean, sigma_DN, np.uint8, 1), sigma_DN) for sigma_DN in SIGMAS_DN),
+            _of_filter(image),
             *_twelve_bit(clean * 16),
             *_roi(clean),
         ]
@@ -93,7 +94,7 @@ def _png(image: Image) -> list[Figure]:
     )
     sizes_MB = [len(data) / 1e6], [len(png) / 1e6]
     return [
-        at_most(45, side_by_side("png, encode 5 MP of 8 bit", "CPU ms", "cv2 default PNG", *encoded)),
+        at_most(25, side_by_side("png, encode 5 MP of 8 bit", "CPU ms", "cv2 default PNG", *encoded)),
         side_by_side("png, decode it", "CPU ms", "cv2 default PNG", *decoded),
         side_by_side("png, decode it for the fit", "CPU ms", "cv2, the same PNG", *for_fit),
         side_by_side("png, its size", "MB", "cv2 default PNG", *sizes_MB),
@@ -105,7 +106,26 @@ def _of_limit(what: str, image: Image, sigma_DN: float) -> Figure:
     ratio = image.nbytes / len(encode_image(_frame(image), "png"))
     limit = 8 * image.itemsize / rounded_noise_bit(sigma_DN)
     figure = side_by_side(f"{what}, noise {sigma_DN:g} DN", ": 1", LIMIT, [ratio], [limit])
-    return ratio_at_least(0.84, figure) if image.itemsize == 1 and sigma_DN == 1.5 else figure
+    return ratio_at_least(0.9, figure) if image.itemsize == 1 and sigma_DN == 1.5 else figure
+
+
+def _of_filter(image: Image) -> Figure:
+    """The same beside the entropy of what PNG's average filter leaves, with codes of their own for each 16 rows: no
+    Huffman code is shorter, and of the five filters this one leaves least."""
+    left, above = np.zeros_like(image), np.zeros_like(image)
+    left[:, 1:], above[1:] = image[:, :-1], image[:-1]
+    rest: Any = image - ((left & above) + ((left ^ above) >> 1))
+    bit = [_entropy_bit(rest[row : row + 16]) for row in range(0, len(rest), 16)]
+    ratio = image.nbytes / len(encode_image(_frame(image), "png"))
+    return side_by_side(
+        "png, 8 bit, noise 1.5 DN", ": 1", "entropy behind the filter", [ratio], [8 * len(bit) / sum(bit)]
+    )
+
+
+def _entropy_bit(values: Image) -> float:
+    share = np.bincount(values.ravel()) / values.size
+    share = share[share > 0]
+    return float(-(share * np.log2(share)).sum())
 
 
 def _twelve_bit(clean_DN: Float) -> list[Figure]:
