@@ -16,6 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from compensation.finding.png_rows import decode_rows
 from compensation.reporting.drawing import figures
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.documents import parse_document
@@ -24,6 +25,7 @@ from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame, Reading
 from markers.detection import detect
 from markers.target import Target
+from recording.format.images import encode_png
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
@@ -103,9 +105,10 @@ async def record(
 
 
 def compile_fit(lock: Path) -> None:
-    """Find markers, one of them under glare: all that is compiled for it is then kept."""
+    """Decode a frame and find markers, one of them under glare: all that is compiled for it is then kept."""
     with lock.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
+        decode_rows(encode_png(np.zeros((8, 64), np.uint8)))
         detect(photo(GLARE[0]), parse_document(TARGET_YAML, Target, "target.yaml"))
 
 

@@ -83,7 +83,7 @@ steps:
 
 
 @pytest.fixture
-def _aravis() -> None:
+def _aravis(compiled_fit: None) -> None:
     require_aravis()
 
 

@@ -42,7 +42,7 @@ HOME_CHECKS = 4 + 6  # both axes: twice in the calibration, three times in the v
 
 
 @pytest.fixture
-def _aravis() -> None:
+def _aravis(compiled_fit: None) -> None:
     require_aravis()
 
 

@@ -39,7 +39,7 @@ def _aravis() -> None:
     require_aravis()
 
 
-pytestmark = pytest.mark.usefixtures("_aravis")
+pytestmark = pytest.mark.usefixtures("_aravis", "compiled_fit")
 
 
 async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: Path, order: Callable[..., Order]):

@@ -51,6 +51,7 @@ def simulated() -> dict[str, dict[str, object]]:
     return yaml.safe_load(packaged("", "simulated").read_text())
 
 
+@pytest.mark.usefixtures("compiled_fit")
 @pytest.mark.parametrize("encoding", [pytest.param("png", marks=pytest.mark.nightly), "roi"])
 def test_each_camera_exposes_at_each_capture_and_a_model_takes_the_leading_ones_frames(tmp_path: Path, encoding: str):
     require_aravis()
