@@ -30,7 +30,7 @@ def fit_like(
 ) -> None:
     """Fit the drift model of a new unit of a camera type to few frames, with what other units of the type have shown.
 
-    A warm-up, the reference and a set-point on each side of it, such as 14 and 45 degC, teach more than a hot one alone.
+    A warm-up, the reference and a set-point on each side of it, 14 and 45 degC say, teach more than a hot one alone.
 
     Example: compensate fit-like sessions/20260108T180000Z-short unit-1.json unit-2.json unit-3.json -o unit-4.json
     """
