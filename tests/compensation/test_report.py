@@ -200,14 +200,12 @@ def test_an_interval_that_claims_too_much_is_reported(numbers: Numbers):
 
 def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers):
     assert numbers.model is not None
-    two = replace(
-        numbers.model, session_ids=("night-1", "night-2"), nights_compared=2, between_nights_px=(0.004, 0.009)
-    )
-    paper = replace(numbers.model, between_nights_px=None)
+    one = replace(numbers.model, between_nights_px=(0.004, 0.009))
+    two = replace(one, session_ids=("night-1", "night-2"), nights_compared=2)
     for model, said, row in (
-        (numbers.model, "was assumed, not measured", "fitted, assumed"),
+        (one, "was assumed, not measured", "fitted, assumed"),
         (two, "", "fitted, of 2 compared"),
-        (paper, "is not known", ""),
+        (numbers.model, "is not known", ""),  # of the paper's form
     ):
         page = page_of("", list(uncertainty_section(replace(numbers, model=model))))
         assert (f"How well nights repeat {said}" in page) == bool(said)
