@@ -106,31 +106,21 @@ def settle(
     start, gathered_at = p.copy(), p.copy()
     far = math.isnan(p[B0])
     gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
-    gatherings = 1
-    variance = math.nan
+    gatherings, variance, is_near = 1, math.nan, False
     if far:
         set_start_levels(pixels, p, scale)
     fixed = mean_radius(p, scale) < _SLOPES_FROM_PX
-    free = PARAMETERS - 4 * fixed
-    is_near = False
     for _ in range(_STEPS):
-        squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right, is_near)
-        if weights < _PIXELS_PER_PARAMETER * free:
+        variance, step = next_step(pixels, p, scale, noise, work, belief, fixed, is_near)
+        if math.isnan(variance):
             return Outcome(TOO_FEW, math.nan, gathered.seen, gathered.burnt, gathered.cut)
-        add_belief(work, p, belief, is_near)
-        if fixed:
-            hold_slopes(work)
-        variance = squares / (weights - free)
-        step = limited(newton_step(work), p, scale)
         for i in range(PARAMETERS):
             p[i] += step[i]
         if not possible(p, noise) or strayed(start, p, scale, 1.5):
             return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         length, gained = math.hypot(step[CX], step[CY]), gain(work, step)
         far = length > _FAR_PX
-        is_last = length < _CONVERGED_PX and gained < variance
-        if is_near:
-            is_last = length < _SHORT_PX and gained < _SHORT_GAIN * variance
+        is_last = is_short(length, gained / variance, is_near)
         is_near = not is_near and length < _NEAR_PX and gained < _NEAR_GAIN * variance
         if is_near:
             sharpen(work, (p[SIGMA] - step[SIGMA]) / p[SIGMA])
@@ -141,12 +131,36 @@ def settle(
             is_near = False
             if gathered.seen < 0:
                 return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
-        # g'd is what the step gains: less than a pixel's share once all twelve have settled.
         elif is_last:
             break
     if strayed(start, p, scale, 1.0):
         return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
     return Outcome(SETTLED, variance, gathered.seen, gathered.burnt, gathered.cut)
+
+
+@compiled
+def next_step(
+    pixels: Pixels, p: Float, scale: float, noise: Variance, work: Work, belief: Belief, fixed: bool, is_near: bool
+) -> tuple[float, Float]:
+    """The variance of a pixel about the model, NaN when there are too few for it, and the step (12,) from `p`. fixed:
+    the levels have no slopes. is_near: J'WJ is that of the step before."""
+    free = PARAMETERS - 4 * fixed
+    squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right, is_near)
+    if weights < _PIXELS_PER_PARAMETER * free:
+        return math.nan, p
+    add_belief(work, p, belief, is_near)
+    if fixed:
+        hold_slopes(work)
+    return squares / (weights - free), limited(newton_step(work), p, scale)
+
+
+@compiled
+def is_short(length_px: float, gain: float, is_near: bool) -> bool:
+    """Whether a step is the last one. gain: in variances of a pixel, less than one's share once all twelve parameters
+    have settled."""
+    if is_near:
+        return length_px < _SHORT_PX and gain < _SHORT_GAIN
+    return length_px < _CONVERGED_PX and gain < 1
 
 
 @compiled
