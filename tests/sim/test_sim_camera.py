@@ -8,6 +8,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from drivers.sim.gige.camera import FakeCamera
 from drivers.sim.gige.genicam import features
 from drivers.sim.gige.gvcp import Ack, Command, Request, Resend, Status
 from drivers.sim.gige.gvsp import Kind, Packet
-from drivers.sim.gige.gvsp_sender import CameraFaults
+from drivers.sim.gige.gvsp_sender import CameraFaults, StreamSender
 from foundation.clock import FollowedClock, seconds_ns
 from tests.addresses import camera_address
 from tests.sim.gvcp_client import decode_ack, decode_leader, pack_read_memory, pack_words
@@ -299,6 +300,34 @@ def test_a_dropped_leader_or_trailer_comes_when_asked_for(
     client.resend(1, 0, 0xFFFFFF)
     again = [client.packet() for _ in range(last_id + 1)]
     assert [packet.packet_id for packet in again] == list(range(last_id + 1))
+
+
+def test_a_packet_may_be_asked_for_again_as_soon_as_it_is_there(
+    client: Client, faults: CameraFaults, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The client may be quicker than the thread that has sent it."""
+    faults.drop_trailer = True
+    last_id, asked = -(-WIDTH * HEIGHT // 7964) + 1, threading.Event()
+    transmit, resend = StreamSender._transmit, StreamSender.resend
+
+    def transmit_and_wait(sender: StreamSender, *sent: Any) -> None:
+        transmit(sender, *sent)
+        if sender.counts.packets == last_id:
+            asked.wait(WAIT_s)
+
+    def resend_and_say(sender: StreamSender, request: Resend) -> None:
+        resend(sender, request)
+        asked.set()
+
+    monkeypatch.setattr(StreamSender, "_transmit", transmit_and_wait)
+    monkeypatch.setattr(StreamSender, "resend", resend_and_say)
+    client.connect(8000)
+    client.arm()
+    client.set("TriggerSoftware", 1)
+    for _ in range(last_id):
+        client.packet()
+    client.resend(1, 0, 0xFFFFFF)
+    assert [client.packet().packet_id for _ in range(last_id + 1)] == list(range(last_id + 1))
 
 
 def test_only_the_last_four_frames_can_be_asked_for_again(client: Client, camera: FakeCamera) -> None:

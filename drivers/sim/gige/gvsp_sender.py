@@ -236,12 +236,13 @@ class StreamSender:
                 self.counts.unavailable += 1
                 self._transmit([header], destination)
             for job in jobs:
-                self.counts.resent += job.status == gvsp.RESENT
+                if job.status == gvsp.RESENT:
+                    self.counts.resent += 1
+                else:
+                    self._left = job.packet_id  # before it has: who gets it may ask for it at once
                 self._mangle(job.block.packet(job.packet_id, job.status), job.destination)
-                if job.status != gvsp.RESENT:
-                    self._left = job.packet_id
-                    if job.packet_id == 0 and self._faults.leader_early_s > 0:
-                        self._closed.wait(self._faults.leader_early_s)
+                if job.status != gvsp.RESENT and job.packet_id == 0 and self._faults.leader_early_s > 0:
+                    self._closed.wait(self._faults.leader_early_s)
             self._pace(sum(job.block.packet_size for job in jobs), len(jobs))
 
     def _mangle(self, parts: tuple[bytes, bytes | memoryview], destination: Destination) -> None:
