@@ -120,6 +120,7 @@ def test_what_is_wrong_is_said_of_its_device_and_keeps_none_of_the_others(config
 def test_with_moves_timer_flap_and_camera_are_measured_and_all_is_as_before(config: Path) -> None:
     known = yaml.safe_load(config.read_text())
     del known["axes"]  # homing takes longer than all the rest
+    known["relays"]["self_test_s"] = 3.0  # a test that a busy machine holds up says nothing of the board
     config.write_text(yaml.safe_dump(known))
     laboratory(config, {"do": "fault", "name": "relays.no_rearm", "value": True})
     status, findings = check(config, "--moves")
