@@ -29,7 +29,7 @@ _EARLY_S = 1.0  # a relay that is off so shortly before its time may just have d
 # The self-test of the dead-man, in units of self_test_s / 3: armed, armed again, must be on, must be off.
 _AGAIN, _STILL_ON, _OFF, _PULSE = 2.0, 4.0, 6.5, 3.0
 _LOOK = 0.05  # between looks of a test that is timed
-_TEST_TRIES = 3  # of that test, when this computer is held up in it
+_TEST_TRIES = 5  # of that test, when this computer is held up in it
 
 
 @dataclass(frozen=True, slots=True)
