@@ -9,8 +9,8 @@ export MALLOC_TRIM_THRESHOLD_ := 1073741824
 # Tests start some hundred programs: each would compile the sources again where keeping bytecode is switched off.
 export PYTHONDONTWRITEBYTECODE :=
 BIN := $(VENV)/bin
-# Tests wait half of their time, for real clocks and other processes.
-WORKERS := $(shell workers=$$(($$(nproc) * 2)); echo $$((workers < 8 ? workers : 8)))
+# Tests wait two thirds of their time, for real clocks and other processes.
+WORKERS := $(shell workers=$$(($$(nproc) * 3)); echo $$((workers < 12 ? workers : 12)))
 RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
 PEER_PACKAGES := aravis-tools-cli aravis-tools chromium gcc libc6-dev
 
