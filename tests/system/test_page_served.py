@@ -102,7 +102,7 @@ async def test_a_run_begun_by_the_form_goes_on_without_a_browser(served_page):
             await page.locator("#recipe").select_option("trial")
             await page.get_by_text("A quarter of an hour").wait_for()
             await page.get_by_role("button", name="Add to the queue").click()
-            await page.get_by_text("is queued").wait_for()
+            await page.get_by_text("(trial) is queued").wait_for()
         await until(served, lambda state: state.run is not None and state.run.step > 1)
         async with a_page(chromium, port, "sessions") as page:
             page.set_default_timeout(120_000)
