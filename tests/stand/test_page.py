@@ -266,7 +266,7 @@ async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):
         await frames.fill("120")
         await page.get_by_label("cameras", exact=True).first.fill("lens A, lens B")
         await page.get_by_role("button", name="Add to the queue").click()
-        await page.get_by_text("is queued").wait_for()
+        await page.get_by_role("status").filter(has_text="is queued").wait_for()
         run = night.queue[-1]
         order, _ = night.requests[run.key]
         assert '"frames":120' in order.recipe_text
@@ -286,7 +286,7 @@ async def test_steps_and_parts_within_parts_have_fields_of_their_own(night):
         await page.get_by_role("button", name="Add to steps, one after another").click()
         await page.get_by_label("soak", exact=True).last.fill("90")
         await page.get_by_role("button", name="Add to the queue").click()
-        await page.get_by_text("is queued").wait_for()
+        await page.get_by_role("status").filter(has_text="is queued").wait_for()
         reported = json.loads(night.requests[night.queue[-1].key][0].recipe_text)
         assert reported["steps"][-1] == {"soak": 90}
         repeat = next(step["repeat"] for step in reported["steps"] if "repeat" in step)
