@@ -13,10 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from foundation.errors import SessionError
-from stand.commands.order_cli import app as order_app
 from stand.serving import presence as runtime
 from stand.serving.api.listening import MOST_CLIENTS
 from stand.serving.client import running_sessions, server_of
@@ -237,15 +235,6 @@ async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tm
         shutil.rmtree(new.parent)
         assert await asyncio.to_thread(_answers, old)
         assert not await asyncio.to_thread(_answers, new)
-
-
-async def test_devices_by_hand_name_the_daemon_that_runs_elsewhere(tmp_path: Path):
-    async with served(ADesk(), tmp_path):
-        listed = await asyncio.to_thread(CliRunner().invoke, order_app, ["device", "flap", "--config", "simulated"])
-    first = listed.stdout.splitlines()[0]
-    assert "no daemon runs in sessions" in first
-    assert str(tmp_path) in first
-    assert "--dir" in first
 
 
 def _answers(session: Path) -> bool:

@@ -1,0 +1,18 @@
+"""`stand device` in a folder that no daemon has, while one runs elsewhere."""
+
+import asyncio
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from stand.commands.order_cli import app as order_app
+from tests.stand.a_desk import ADesk, served
+
+
+async def test_devices_by_hand_name_the_daemon_that_runs_elsewhere(tmp_path: Path):
+    async with served(ADesk(), tmp_path):
+        listed = await asyncio.to_thread(CliRunner().invoke, order_app, ["device", "flap", "--config", "simulated"])
+    first = listed.stdout.splitlines()[0]
+    assert "no daemon runs in sessions" in first
+    assert str(tmp_path) in first
+    assert "--dir" in first
