@@ -57,6 +57,9 @@ def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
 
 
 class _SerialLink:
+    """A port opened by pyserial. Its bytes go by the descriptor: pyserial waits twice for each reply, and after each
+    request for room for the next one."""
+
     def __init__(self, device: str, path: str, settings: SerialSettings) -> None:
         self._device = device
         self._path = path
@@ -76,21 +79,36 @@ class _SerialLink:
 
     def write(self, data: bytes) -> None:
         try:
-            self._port.write(data)
+            if rest := data[_taken_at_once(self._port.fileno(), data) :]:
+                self._port.write(rest)  # waits for room
         except (OSError, termios.error) as error:
             raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
 
     def read(self, timeout_s: float) -> bytes:
         try:
-            if timeout_s > 0:  # waited for here, because pyserial reconfigures the whole port for another time-out
-                select.select([self._port], [], [], timeout_s)
-            return self._port.read(_READ_SIZE)
+            port = self._port.fileno()
+            if not select.select([port], [], [], timeout_s)[0]:
+                return b""
+            data = os.read(port, _READ_SIZE)
+        except BlockingIOError:
+            return b""
         except (OSError, termios.error) as error:
             raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
+        if not data:  # ready, and yet nothing: unplugged
+            raise Unreachable(self._device, f"{self._path} is gone (nothing to read where there should be)")
+        return data
 
     def close(self) -> None:
         with contextlib.suppress(OSError, termios.error):
             self._port.close()
+
+
+def _taken_at_once(port: int, data: bytes) -> int:
+    """How many bytes the port has room for."""
+    try:
+        return os.write(port, data)
+    except BlockingIOError:
+        return 0
 
 
 def why_closed(error: Exception) -> str:
