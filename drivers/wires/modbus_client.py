@@ -10,6 +10,7 @@ import logging
 import socket
 import struct
 import termios
+import time
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import Literal
@@ -17,8 +18,8 @@ from typing import Literal
 import serial
 from pydantic import Field
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
-from pymodbus.exceptions import ConnectionException, ModbusException
-from pymodbus.pdu import ModbusPDU
+from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
+from pymodbus.pdu import DecodePDU, ModbusPDU
 from pymodbus.pdu.bit_message import (
     ReadCoilsRequest,
     ReadCoilsResponse,
@@ -145,8 +146,10 @@ REPLIES = (
     ),
 )
 
+_REPLY_OF = {reply.function_code: reply for reply in REPLIES}
 
-class _SerialClient(ModbusSerialClient):
+
+class SerialClient(ModbusSerialClient):
     """pymodbus over pyserial, without its polling."""
 
     def connect(self) -> bool:
@@ -173,8 +176,45 @@ class _SerialClient(ModbusSerialClient):
         return first + self.socket.read(self.socket.in_waiting) if first else b""
 
 
-class _TcpClient(ModbusTcpClient):
-    """pymodbus over TCP. The kernel keeps the time-out: a reply then costs one call of it instead of three."""
+class _Decoder(DecodePDU):
+    """pymodbus' own, without its log: that writes each reply as text, also where nobody reads it."""
+
+    def decode(self, frame: bytes) -> ModbusPDU | None:
+        """A reply's message; None when it cannot be one."""
+        reply = _REPLY_OF.get(frame[0])
+        if reply is None:  # an exception, or nothing that was asked for
+            return super().decode(frame)
+        message = reply()
+        try:
+            message.decode(frame[1:])
+        except (ModbusException, ValueError, IndexError, struct.error):
+            return None
+        return message
+
+
+class TcpClient(ModbusTcpClient):
+    """pymodbus' messages and frames over TCP. The kernel keeps the time-out: a reply then costs one call of it instead
+    of three. Without pymodbus' transactions, which repeat and look for echoes; neither is wanted here."""
+
+    number = 0  # of the last transaction
+
+    def execute(self, no_response_expected: bool, request: ModbusPDU) -> ModbusPDU:
+        """The reply to one request, sent once; ModbusIOException when none comes within the time-out."""
+        self.number = request.transaction_id = self.number % 0xFFFF + 1
+        trace, timeout_s = self.transaction.trace_packet, self.comm_params.timeout_connect or 0.0
+        self.send(trace(True, self.framer.buildFrame(request)))
+        deadline_s, heard = time.monotonic() + timeout_s, b""
+        while data := self.recv(None):
+            heard = trace(False, heard + data)
+            used, reply = self.framer.handleFrame(heard, request.dev_id, request.transaction_id)
+            if reply is not None:
+                if (reply.dev_id, reply.transaction_id) != (request.dev_id, request.transaction_id):
+                    raise ModbusIOException("the reply is to no request of ours")
+                return reply
+            heard = heard[used:]
+            if time.monotonic() >= deadline_s:
+                break
+        raise ModbusIOException("no reply in time")
 
     def connect(self) -> bool:
         """Connect; raises OSError with the reason."""
@@ -209,15 +249,17 @@ class ModbusClient:
         self._settings = settings
         self._place = place_of(settings.address)
         self.serial = isinstance(self._place, SerialPlace)
-        self._client: _SerialClient | _TcpClient | None = None
+        self._client: SerialClient | TcpClient | None = None
         self._sent = b""
         self._heard = b""
+        self._reads: dict[tuple[int, Space, int, int], ModbusPDU] = {}  # a stand asks for the same again and again
 
     def connect(self) -> None:
         """Open the port or connection unless it is open; raises WireFault LINE_DOWN with the reason."""
         if self._client is not None:
             return
         client = self._make()
+        client.framer.decoder = _Decoder(is_server=False)
         for reply in REPLIES:
             client.register(reply)
         try:
@@ -228,13 +270,13 @@ class ModbusClient:
             raise WireFault(FaultKind.LINE_DOWN, text) from error
         self._client = client
 
-    def _make(self) -> _SerialClient | _TcpClient:
+    def _make(self) -> SerialClient | TcpClient:
         settings, place = self._settings, self._place
         if isinstance(place, TcpPlace):
-            return _TcpClient(
+            return TcpClient(
                 place.host, port=place.port, timeout=settings.timeout_s, retries=0, trace_packet=self._trace
             )
-        return _SerialClient(
+        return SerialClient(
             place.path,
             baudrate=settings.baud,
             parity=settings.parity,
@@ -271,7 +313,11 @@ class ModbusClient:
 
     def read(self, unit: int, space: Space, address: int, count: int) -> list[int]:
         """`count` registers or bits (0 or 1) from `address` on."""
-        reply = self._exchange(READS[space](dev_id=unit, address=address, count=count))
+        request = self._reads.get((unit, space, address, count))
+        if request is None:
+            request = READS[space](dev_id=unit, address=address, count=count)
+            self._reads[unit, space, address, count] = request
+        reply = self._exchange(request)
         if self.serial and self._heard.startswith(self._sent):
             raise WireFault(FaultKind.GARBLED, "the request came back (local echo of the adapter?)")
         if space in ("holding", "input"):

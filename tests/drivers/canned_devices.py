@@ -7,10 +7,8 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
-from pymodbus.client import ModbusSerialClient, ModbusTcpClient
-
 from drivers.devices.motion.flap import Flap, FlapSettings
-from drivers.wires.modbus_client import BusSettings, ModbusClient, WireFault
+from drivers.wires.modbus_client import BusSettings, ModbusClient, SerialClient, TcpClient, WireFault
 from drivers.wires.ximc_client import XimcClient
 from foundation.clock import VirtualClock
 from foundation.errors import DeviceError, GarbledReply
@@ -50,7 +48,7 @@ class _CannedModbus(ModbusClient):
     def __init__(self, kind: str) -> None:
         super().__init__(BusSettings(address=f"{kind}:{'/dev/x' if kind == 'serial' else '127.0.0.1:502'}"))
         self.wire = Line()
-        base: Any = ModbusSerialClient if self.serial else ModbusTcpClient
+        base: Any = SerialClient if self.serial else TcpClient
         place = {"port": "/dev/x"} if self.serial else {"host": "127.0.0.1"}
         own = {
             "connect": lambda canned: True,
@@ -65,7 +63,7 @@ class _CannedModbus(ModbusClient):
 
     def begin(self, reply: bytes) -> None:
         """`reply` is for the next request, whose transaction number is 1."""
-        self._canned.transaction.next_tid = 0
+        self._canned.number = 0
         self.wire.begin(reply)
 
 

@@ -83,6 +83,14 @@ class MbapResponder(Responder):
         return data[:4] + (len(reply) - 2).to_bytes(2, "big") + reply[:-2] if reply else b""
 
 
+class NumberlessResponder(MbapResponder):
+    """Its replies have the transaction number 0, whatever was asked."""
+
+    def feed(self, data: bytes) -> bytes:
+        reply = super().feed(data)
+        return reply and bytes(2) + reply[2:]
+
+
 def drop(request: bytes, reply: bytes) -> bytes:
     return b""
 
@@ -344,6 +352,16 @@ async def test_over_tcp_a_late_reply_dies_with_its_connection_and_a_hang_up_cost
     with pytest.raises(Unreachable, match="cannot open tcp:127"):
         await read_is_right(bus, 400)
     await bus.close()
+
+
+async def test_over_tcp_a_reply_without_the_number_of_its_request_is_no_reply() -> None:
+    wire = TcpWire("127.0.0.1", 0, NumberlessResponder, LinkFaults())
+    bus = Bus("gateway", BusSettings(address=f"tcp:127.0.0.1:{wire.port}", timeout_s=TIMEOUT_S), WallClock())
+    await bus.open()
+    with pytest.raises(GarbledReply):
+        await bus.write_coil("dut", 1, 3, 0xFF00)
+    await bus.close()
+    wire.close()
 
 
 async def test_a_soak_with_a_fault_in_every_sixth_reply_gives_no_wrong_value(
