@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
+from functools import lru_cache
 
 LETTERS_SIZE = 4
 CRC_SIZE = 2
@@ -47,8 +48,10 @@ def _crc_of_byte(crc: int) -> int:
 _CRC_OF_BYTE = tuple(_crc_of_byte(byte) for byte in range(256))
 
 
+@lru_cache(64)
 def crc16(payload: bytes) -> int:
-    """CRC-16/MODBUS: start 0xFFFF, reflected polynomial 0xA001. Over the payload only, never the letters."""
+    """CRC-16/MODBUS: start 0xFFFF, reflected polynomial 0xA001. Over the payload only, never the letters.
+    A stage at rest says the same at every poll."""
     crc = 0xFFFF
     for byte in payload:
         crc = crc >> 8 ^ _CRC_OF_BYTE[(crc ^ byte) & 0xFF]

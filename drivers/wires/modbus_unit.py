@@ -9,6 +9,7 @@ import math
 import struct
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from drivers.settings import Identity, same_device
 from drivers.wires.bus import Bus
@@ -31,8 +32,7 @@ class Block:
     names: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(NamedTuple):
     """One decoded point: the raw word(s) as an unsigned number; `value` is NaN exactly when `reason` is not empty."""
 
     raw: int
@@ -215,16 +215,19 @@ def decode_blocks(register_map: RegisterMap, replies: Mapping[Block, list[int]])
     """Replies of planned blocks as samples and bits; `bad_if` bits that were not read spoil nothing."""
     samples: dict[str, Sample] = {}
     bits: dict[str, bool] = {}
+    points = register_map.points
     for block, words in replies.items():
         for name in block.names:
-            point = register_map.points[name]
+            point = points[name]
             start = point.address - block.address
-            samples[name] = decode(point, words[start : start + point.words])
-            bits.update(_bits(name, point, samples[name].raw))
-    for name, sample in list(samples.items()):
-        point = register_map.points[name]
-        alarms = [bit for bit in point.bad_if if bits.get(bit)]
-        if alarms:
+            sample = samples[name] = decode(point, words[start : start + point.words])
+            if point.type == "bit":
+                bits[name] = bool(sample.raw)
+            for bit, bit_name in point.bits.items():
+                bits[bit_name] = bool(sample.raw >> bit & 1)
+    for name, sample in tuple(samples.items()):
+        point = points[name]
+        if point.bad_if and (alarms := [bit for bit in point.bad_if if bits.get(bit)]):
             samples[name] = Sample(sample.raw, math.nan, ", ".join(alarms))
         if point.split is not None:
             samples.update(_split(point.split, samples[name]))
@@ -239,7 +242,7 @@ def decode(point: Point, words: list[int]) -> Sample:
     for fault in point.faults:
         if raw == fault.raw:
             return Sample(raw, math.nan, fault.code)
-    number = raw if point.type == "bit" else struct.unpack(FORMATS[point.type], raw.to_bytes(2 * len(words), "big"))[0]
+    number = _number(point.type, raw)
     if point.type == "float32" and 0 < abs(number) < _SMALLEST:
         return Sample(raw, math.nan, f"{number:g} is no measurement; is word_order {point.word_order} right?")
     value = number * point.scale + point.offset
@@ -248,6 +251,19 @@ def decode(point: Point, words: list[int]) -> Sample:
     if point.valid is not None and not point.valid[0] <= value <= point.valid[1]:
         return Sample(raw, math.nan, f"{value:g} {point.unit} is outside {point.valid[0]:g}..{point.valid[1]:g}")
     return Sample(raw, value)
+
+
+def _number(kind: PointType, raw: int) -> float:
+    """What the raw word or words stand for."""
+    match kind:
+        case "int16":
+            return raw - (raw >> 15 << 16)
+        case "int32":
+            return raw - (raw >> 31 << 32)
+        case "float32":
+            return struct.unpack(">f", raw.to_bytes(4, "big"))[0]
+        case _:
+            return raw
 
 
 def encode(point: Point, value: float) -> list[int]:
@@ -265,12 +281,6 @@ def encode(point: Point, value: float) -> list[int]:
         raise ValueError(f"{value:g} {point.unit} does not fit {point.type}") from error
     words = [int.from_bytes(packed[i : i + 2], "big") for i in range(0, len(packed), 2)]
     return words if point.word_order == "high_first" else words[::-1]
-
-
-def _bits(name: str, point: Point, raw: int) -> dict[str, bool]:
-    if point.type == "bit":
-        return {name: bool(raw)}
-    return {bit_name: bool(raw >> bit & 1) for bit, bit_name in point.bits.items()}
 
 
 def _split(split: Split, sample: Sample) -> dict[str, Sample]:
