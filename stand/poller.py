@@ -75,12 +75,14 @@ class Poller:
     def _time(self, took_ns: int) -> None:
         """Of one read that succeeded."""
         took_s, name = round(took_ns / NS_PER_S, 3), self.sensor.name
+        if not self._is_slow and took_s <= self.period_s:
+            return
         data: dict[str, object] = {"device": name, "took_s": took_s, "period_s": self.period_s}
-        if not self._is_slow and took_s > self.period_s:
+        if not self._is_slow:
             self._is_slow = True
             text = f"{name} took {took_s:g} s to answer and is read every {self.period_s:g} s: readings are missing"
             self.hub.publish(Event(self.clock.now_ns(), "warning", "device_slow", text, data))
-        elif self._is_slow and took_s < self.period_s / 2:
+        elif took_s < self.period_s / 2:
             self._is_slow = False
             text = f"{name} answers within {took_s:g} s again"
             self.hub.publish(Event(self.clock.now_ns(), "info", "device_fast", text, data))

@@ -250,18 +250,19 @@ class ControlSocket:
 
     async def request(self, request: Mapping[str, object]) -> dict[str, object]:
         """Send one request and return its answer; Unreachable when the simulator is gone, Refused when it refuses."""
+        return _accepted(await self._answer(json.dumps(request).encode() + b"\n"))
+
+    async def _answer(self, line: bytes) -> bytes:
+        """The line that answers; Unreachable."""
         if self._socket is None:
             raise ValueError("the control socket is not open")
         try:
-            self._socket.sendall(json.dumps(request).encode() + b"\n")
-            line = b""
-            while not line.endswith(b"\n"):
-                line += await self._received(self._socket)
+            self._socket.sendall(line)
+            answer = b""
+            while not answer.endswith(b"\n"):
+                answer += await self._received(self._socket)
         except OSError as error:
             raise Unreachable("simulator", f"the control socket broke ({error})") from error
-        answer: dict[str, object] = json.loads(line)
-        if "error" in answer:
-            raise Refused("simulator", str(answer["error"]))
         return answer
 
     async def _received(self, opened: socket.socket) -> bytes:
@@ -276,11 +277,21 @@ class ControlSocket:
             return data
 
     async def advance(self, now_ns: int) -> None:
-        """Put the simulated laboratory at `now_ns`."""
-        await self.request({"do": "advance", "now_ns": now_ns})
+        """Put the simulated laboratory at `now_ns`; raises as `request`."""
+        line = await self._answer(b'{"do": "advance", "now_ns": %d}\n' % now_ns)
+        if line != b'{"now_ns": %d}\n' % now_ns:
+            _accepted(line)
 
     async def close(self) -> None:
         """Let go; may be called twice."""
         if self._socket is not None:
             self._socket.close()
         self._socket = None
+
+
+def _accepted(line: bytes) -> dict[str, object]:
+    """What the simulator answered; Refused when it refuses."""
+    answer: dict[str, object] = json.loads(line)
+    if "error" in answer:
+        raise Refused("simulator", str(answer["error"]))
+    return answer

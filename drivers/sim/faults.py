@@ -40,6 +40,8 @@ class LinkFaults:
         """The pieces to write instead of `reply`; may wait delay_s first. Nothing when there was no reply."""
         if not reply:
             return []
+        if self._is_sound:
+            return [reply]
         if self.delay_s > 0:
             self._count("delay")
             time.sleep(self.delay_s)  # noqa: TID251 - a slow line is slow in real seconds
@@ -68,6 +70,12 @@ class LinkFaults:
             self._count("echo")
             reply = request + reply
         return [bytes([byte]) for byte in reply] if self.byte_by_byte else [reply]
+
+    @property
+    def _is_sound(self) -> bool:
+        probable = self.drop or self.flip or self.cut or self.junk or self.late
+        other = self.silent or self.delay_s or self.late_s or self.garbled or self.echo or self.byte_by_byte
+        return not (probable or other)
 
     def _chance(self, probability: float, name: str) -> bool:
         if probability <= 0 or self._random.random() >= probability:

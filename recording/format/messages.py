@@ -16,6 +16,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, cast
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -30,6 +31,7 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
 from foundation.items import Batch, Event, Original, StepMark, StepState
 from foundation.readings import Cause, Frame, Quality, Reading
@@ -284,18 +286,23 @@ def decode_original(data: bytes, time_ns: int) -> Original:
 
 def encode_table_pose(time_ns: int, linear_mm: float, rotary_deg: float) -> bytes:
     """Where the table is, as foxglove.PoseInFrame in `stand`: x along the linear axis in m, rotation about z."""
+    pose = _table_pose(linear_mm, rotary_deg)
+    return PoseInFrame(timestamp=timestamp(time_ns), frame_id="stand", pose=pose).SerializeToString()
+
+
+@lru_cache(1)
+def _table_pose(linear_mm: float, rotary_deg: float) -> Pose:
+    """A table stands still most of the time."""
     half_rad = math.radians(rotary_deg) / 2
-    pose = Pose(
+    return Pose(
         position=Vector3(x=linear_mm / 1000), orientation=Quaternion(z=math.sin(half_rad), w=math.cos(half_rad))
     )
-    return PoseInFrame(timestamp=timestamp(time_ns), frame_id="stand", pose=pose).SerializeToString()
 
 
 def timestamp(time_ns: int) -> Timestamp:
     """An instant in Foxglove's messages."""
-    stamp = Timestamp()
-    stamp.FromNanoseconds(time_ns)
-    return stamp
+    seconds, nanos = divmod(time_ns, NS_PER_S)
+    return Timestamp(seconds=seconds, nanos=nanos)
 
 
 def _get(message: Message, field: str) -> Any:

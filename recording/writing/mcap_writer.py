@@ -10,7 +10,8 @@ import zlib
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from struct import Struct
+from itertools import chain
+from struct import Struct, pack
 
 import deflate
 import zstandard
@@ -25,7 +26,6 @@ from mcap.records import (
     Footer,
     Header,
     McapRecord,
-    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
@@ -146,7 +146,7 @@ class McapWriter:
         begin, length = self._write(RECORD.pack(Opcode.CHUNK, len(head) + stored_bytes) + head, *parts)
         places: dict[int, int] = {}
         for channel, entries in chunk.places.items():
-            places[channel], _ = self._write(bytes_of(MessageIndex(channel_id=channel, records=entries)))
+            places[channel], _ = self._write(_message_index(channel, entries))
         self._chunk_indexes.append(
             ChunkIndex(
                 chunk_length=length,
@@ -214,3 +214,9 @@ class McapWriter:
         self._parts += parts
         self._written_bytes += sum(map(len, parts))
         return begin, self._written_bytes - begin
+
+
+def _message_index(channel: int, places: list[tuple[int, int]]) -> bytes:
+    """The record that says where in its chunk the messages of a channel are, by their log times."""
+    entries = pack(f"<HI{2 * len(places)}Q", channel, 16 * len(places), *chain.from_iterable(places))
+    return RECORD.pack(Opcode.MESSAGE_INDEX, len(entries)) + entries

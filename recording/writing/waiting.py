@@ -36,7 +36,8 @@ class Waiting:
 
     def item_published(self, now_ns: int) -> None:
         """One item of telemetry."""
-        self._new_ns = _earliest(self._new_ns, now_ns)
+        if self._new_ns is None or now_ns < self._new_ns:
+            self._new_ns = now_ns
 
     def items_taken(self) -> int:
         """A commit of all items published so far begins; its number."""

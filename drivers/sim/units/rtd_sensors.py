@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from drivers.sim.units.modbus import ILLEGAL_ADDRESS, Handler, Refusal, Timeline, answer
@@ -73,13 +72,15 @@ class RtdModule:
         self._sensors = {number: places.get(name, self._air_degC) for name, number in channels.items()}
         self._drifted_K: dict[int, float] = {}
         self._loose_degC: dict[int, float] = {}  # of the sensors that hang in the laboratory
+        self._random = random.Random()
         self._drawn_ns = 0
         self._drawn: dict[int, float] = {}  # noise at that time by channel, in units of its standard deviation
         plant.on_step.append(self._on_step)
 
     def handle(self, pdu: bytes) -> bytes | None:
         """The reply to a request."""
-        with self._now():
+        with self._plant.lock:
+            self._plant.advance(self._clock.now_ns())
             return None if self.silent else answer(pdu, self.functions)
 
     def measured_degC(self, place: int) -> float:
@@ -109,14 +110,9 @@ class RtdModule:
         if self._drawn_ns != self._plant.now_ns:
             self._drawn_ns, self._drawn = self._plant.now_ns, {}
         if channel not in self._drawn:
-            self._drawn[channel] = random.Random(f"{self._seed} {channel} {self._drawn_ns}").gauss(0.0, 1.0)
+            self._random.seed(f"{self._seed} {channel} {self._drawn_ns}")
+            self._drawn[channel] = self._random.gauss(0.0, 1.0)
         return self._drawn[channel]
-
-    @contextmanager
-    def _now(self) -> Generator[None]:
-        with self._plant.lock:
-            self._plant.advance(self._clock.now_ns())
-            yield
 
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         for channel, rate_K_per_h in self.drift_K_per_h.items():
