@@ -26,7 +26,6 @@ CAMERA = "camera.temperature"
 _TIME_CONSTANTS = 5.0
 _LOOK_S = 10.0
 _UNKNOWN_S = 60.0  # without a reading; a longer gap leaves open what happened in it
-_KEPT = 20_000  # readings: hours
 
 
 class CameraEquilibrium:
@@ -38,7 +37,7 @@ class CameraEquilibrium:
         self._hub = hub
         self._clock = clock
         self._since_ns = clock.now_ns()  # what is read before counts for nothing
-        self._readings: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+        self._readings: deque[tuple[float, float]] = deque()
         self._listeners: list[Callable[[], None]] = []
         hub.subscribe(self._receive)
 
@@ -134,4 +133,10 @@ class CameraEquilibrium:
             for reading in item.readings:
                 is_good = reading.channel == CAMERA and reading.quality is Quality.GOOD
                 if is_good and reading.time_ns >= self._since_ns:
-                    self._readings.append((seconds(reading.time_ns), reading.value))
+                    self._keep(seconds(reading.time_ns), reading.value)
+
+    def _keep(self, time_s: float, camera_degC: float) -> None:
+        """As long as a rate is judged by it."""
+        self._readings.append((time_s, camera_degC))
+        while self._readings[0][0] < time_s - self._limits.duration_s:
+            self._readings.popleft()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections import deque
+from array import array
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 CHAMBER, CAMERA = "regulator.pv", "camera.temperature"
 _UNKNOWN_S = 60.0
-_KEPT = 20_000  # readings: more than a day at one every 5 s
+_KEPT = 20_000  # readings, at least: more than a day at one every 5 s
 
 
 def load_for(plan: Iterable[PlannedStep]) -> None:
@@ -43,7 +43,8 @@ class SettlingWatch:
         self._clock = clock
         self._target = target
         self._lane = Lane("settling", clock)
-        self._readings = {name: deque[tuple[float, float]](maxlen=_KEPT) for name in (CHAMBER, CAMERA)}
+        # Time in s and degC, one after the other: as tuples of objects they were most of what a night's memory grew by.
+        self._readings = {name: array("d") for name in (CHAMBER, CAMERA)}
         self._digit_K = 0.0
         self._looks: list[Float] = []
         self._before: Detection | None = None
@@ -59,7 +60,7 @@ class SettlingWatch:
     def restart(self) -> None:
         """A new window: what was seen before a soak, a pause or a disturbance proves nothing about the time after."""
         for readings in self._readings.values():
-            readings.clear()
+            del readings[:]
         self._forget_looks("")
         self._due_ns = None
 
@@ -123,28 +124,25 @@ class SettlingWatch:
             for reading in item.readings:
                 kept = self._readings.get(reading.channel)
                 if kept is not None and not _is_passing(reading, kept):
-                    kept.append((seconds(reading.time_ns), reading.value))
+                    kept.extend((seconds(reading.time_ns), reading.value))
+                    if len(kept) > 4 * _KEPT:
+                        del kept[: 2 * _KEPT]
 
     def _tell(self, level: str, kind: str, text: str) -> None:
         self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
 
     def _has_arrived(self, chamber_degC: float) -> bool:
         chamber = self._readings[CHAMBER]
-        return bool(chamber) and abs(chamber[-1][1] - chamber_degC) <= BAND_K
+        return bool(chamber) and abs(chamber[-1] - chamber_degC) <= BAND_K
 
     def _seen(self) -> Seen:
-        chamber, camera = (_table(self._readings[name], 2).T for name in (CHAMBER, CAMERA))
+        chamber, camera = (np.array(self._readings[name]).reshape(-1, 2).T for name in (CHAMBER, CAMERA))
         # A camera at rest shows one digit only; how wide that is shows while it moves.
         self._digit_K = min(filter(None, (self._digit_K, digit_K(camera[1]))), default=0.0)
-        return Seen(chamber, camera, self._digit_K, _table(self._looks, 6))
+        return Seen(chamber, camera, self._digit_K, np.array(self._looks, np.float64).reshape(-1, 6))
 
 
-def _is_passing(reading: Reading, kept: deque[tuple[float, float]]) -> bool:
+def _is_passing(reading: Reading, kept: array[float]) -> bool:
     """A poll that failed on the wire says nothing, and soon it is asked again; when that lasts, what was meanwhile is
     not known."""
-    return reading.cause == "wire" and bool(kept) and seconds(reading.time_ns) - kept[-1][0] < _UNKNOWN_S
-
-
-def _table(rows: Iterable[object], width: int) -> Float:
-    """(n, width), also when there are none."""
-    return np.array(list(rows), np.float64).reshape(-1, width)
+    return reading.cause == "wire" and bool(kept) and seconds(reading.time_ns) - kept[-2] < _UNKNOWN_S
