@@ -3,6 +3,8 @@ off."""
 
 import asyncio
 import math
+import tracemalloc
+from typing import Any
 
 import pytest
 
@@ -14,6 +16,7 @@ from foundation.readings import Reading, bad_reading
 from stand.imaging.camera_cooling import CameraTemperature
 from stand.imaging.equilibrium import CameraEquilibrium
 from stand.running.executing.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
+from stand.running.executing.settling_watch import SettlingWatch
 
 TIME_CONSTANT_S, RISE_K = 900.0, 20.0
 
@@ -120,3 +123,20 @@ def test_camera_minus_air_is_compared_once_at_the_nearest_set_point(after_K, kin
         "gap_ns": 7,
         "gap_end_ns": 9,
     }
+
+
+def test_what_is_kept_of_a_camera_does_not_grow_with_the_hours():
+    hub = Hub()
+    equilibrium = CameraEquilibrium(EquilibriumSettings(), hub, VirtualClock(0))
+    nobody: Any = None  # neither the stand nor its target is asked
+    settling = SettlingWatch(nobody, hub, VirtualClock(0), nobody)
+    sizes: list[int] = []
+    tracemalloc.start(1)
+    for second in range(12_000):
+        publish(hub, "camera.temperature", second * NS_PER_S, 24.0 + second / 1000)
+        if second in (2_000, 11_999):
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    settling.close()
+    equilibrium.forget()
+    assert sizes[1] - sizes[0] < 400_000  # bytes: two numbers a second, and not two objects
