@@ -294,6 +294,8 @@ class ModbusClient:
 
     def unread_bytes(self) -> int:
         """Bytes that came without a request; 0 over TCP, where transaction numbers expose them."""
+        if not self.serial:
+            return 0
         port = self._client.socket if self._client is not None else None
         try:
             return port.in_waiting if isinstance(port, serial.Serial) else 0

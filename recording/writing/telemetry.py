@@ -207,7 +207,8 @@ class BatchEncoder:
         for reading in readings:
             names = self._fields.get((reading.channel, reading.unit))
             if names is not None:
-                fields[names[0]] = messages.canonical(reading.value)
+                value = reading.value
+                fields[names[0]] = value if value == value else math.nan
                 fields[names[1]] = messages.QUALITY_NUMBER[reading.quality]
             if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
                 remarks.append(_remark(reading))
