@@ -81,8 +81,14 @@ def message_of(seq: int, utc_offset_ns: int, item: Item) -> Message:
 def reading_of(reading: Reading) -> dict[str, object]:
     """The fields of desk.ReadingState."""
     value = None if reading.quality is Quality.BAD else reading.value
-    fields = {"value": value, "unit": reading.unit, "quality": reading.quality, "time_ns": reading.time_ns}
-    return {**fields, "reason": reading.reason, "cause": reading.cause}
+    return {
+        "value": value,
+        "unit": reading.unit,
+        "quality": reading.quality,
+        "time_ns": reading.time_ns,
+        "reason": reading.reason,
+        "cause": reading.cause,
+    }
 
 
 class Viewer:
