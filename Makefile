@@ -27,7 +27,7 @@ test: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
-	@$(BIN)/pyright & types=$$!; $(BIN)/pytest -n $(WORKERS) --no-loadscope-reorder; tests=$$?; \
+	@$(BIN)/pyright & types=$$!; $(BIN)/pytest -n $(WORKERS); tests=$$?; \
 		wait $$types || { echo "pyright has found errors, see above"; exit 1; }; exit $$tests
 
 nightly: setup

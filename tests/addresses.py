@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import re
 import socket
 from pathlib import Path
 from typing import Any
@@ -10,13 +9,14 @@ from typing import Any
 # Below the kernel's ephemeral ports, which it hands out to every client on this machine.
 _FIRST_PORT, _PORTS_PER_WORKER = 10_000, 1_500
 
-WORKER = int("0" + re.sub(r"\D", "", os.environ.get("PYTEST_XDIST_WORKER", "")))  # gw0, gw1 ...; 0 without xdist
+WORKER = "TEST_WORKER"
+"""In the environment of a worker this is its number."""
 _ports, _cameras = itertools.count(os.getpid()), itertools.count()
 
 
 def free_port() -> int:
     """A TCP port of 127.0.0.1 that nobody listens at, and that this worker has not been given for a long time."""
-    first = _FIRST_PORT + WORKER % 14 * _PORTS_PER_WORKER
+    first = _FIRST_PORT + int(os.environ.get(WORKER, "0")) % 14 * _PORTS_PER_WORKER
     for number in itertools.islice(_ports, _PORTS_PER_WORKER):
         port = first + number % _PORTS_PER_WORKER
         with socket.socket() as probe:

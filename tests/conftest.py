@@ -1,11 +1,10 @@
-"""What all tests share: the stock camera, and how they are dealt out to the workers of pytest-xdist."""
+"""What all tests share: the stock camera, and how they are dealt out to the workers."""
 
 import gc
 import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path, PurePath
-from typing import Any
 
 import pytest
 
@@ -13,9 +12,10 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from recording.writing import notices
-from tests.addresses import WORKER
+from tests import forked
 from tests.forked import STARTERS, Forks, Programs
 from tests.stock_camera import run_stock_camera
+from tests.workers import run_units
 
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
 _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera.py"}
@@ -44,16 +44,6 @@ def pytest_configure(config: pytest.Config) -> None:
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, usual)
     gc.disable()
-    if config.args == config.getini("testpaths") and (workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT")):
-        config.args = _own_order(config.rootpath, int(workers))
-
-
-def _own_order(root: Path, workers: int) -> list[str]:
-    """The folders of all tests. Each worker begins with others: on a clean checkout each module is then compiled by
-    one of them, and taken from its cache by the others."""
-    folders = sorted(str(each.relative_to(root)) for each in (root / "tests").iterdir() if any(each.glob("test_*.py")))
-    begin = WORKER * len(folders) // workers
-    return folders[begin:] + folders[:begin]
 
 
 def pytest_collection_finish() -> None:
@@ -90,12 +80,13 @@ def _roomy_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _forked_programs(runtime_folder: Path) -> Iterator[None]:
     """A program that a test starts begins at once."""
-    forks = Forks()
+    forks = None if forked.is_served() else Forks()
     with pytest.MonkeyPatch.context() as patch:
         for starter in STARTERS:
             patch.setattr(f"{starter}.subprocess", Programs)
         yield
-    forks.close()
+    if forks:
+        forks.close()
 
 
 @pytest.fixture(scope="session")
@@ -132,31 +123,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=turn)
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Workers of `-n` take units of tests in their order, one after the other."""
-    from xdist.scheduler import LoadScopeScheduling
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.getgroup("workers")._addoption(
+        "-n", dest="workers", type=int, default=0, metavar="N", help="run the tests in N processes (tests/workers.py)"
+    )
 
-    class Units(LoadScopeScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            return _unit(nodeid)
 
-        def remove_node(self, node: Any) -> str | None:
-            """A test whose worker died has failed; xdist would run it again until no worker is left."""
-            waiting = [test for unit in self.assigned_work[node].values() for test, done in unit.items() if not done]
-            for unit in self.assigned_work[node].values():
-                if waiting and waiting[0] in unit:
-                    unit[waiting[0]] = True
-            super().remove_node(node)
-            return waiting[0] if waiting else None
-
-        def _reschedule(self, node: Any) -> None:
-            """A worker begins a test when it knows the one after it, or that there is none: the successor of a dead
-            worker, to which xdist gives one unit, would wait for ever."""
-            super()._reschedule(node)
-            while self.workqueue and not node.shutting_down and self._pending_of(self.assigned_work[node]) < 2:
-                self._assign_work_unit(node)
-            if not self.workqueue and not node.shutting_down and self._pending_of(self.assigned_work[node]) < 2:
-                node.shutdown()
-
-    return Units(config, log)
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """One process forks the programs of all workers: it loads their modules once."""
+    workers, are_listed = session.config.option.workers, session.config.option.collectonly
+    if not workers or are_listed or session.testsfailed:
+        return None  # the usual loop runs them, or says what could not be collected
+    units: dict[str, list[pytest.Item]] = {}
+    for item in session.items:
+        units.setdefault(_unit(item.nodeid), []).append(item)
+    forks = Forks()
+    try:
+        run_units(session, list(units.values()), workers)
+    finally:
+        forks.close()
+    return True

@@ -80,6 +80,11 @@ class Programs:
     Popen, run = staticmethod(popen), staticmethod(subprocess.run)
 
 
+def is_served() -> bool:
+    """A process that forks programs for this one is there."""
+    return bool(_address)
+
+
 class _Forked(subprocess.Popen[Any]):
     """A program forked by another process, which says on a line of its own how it has ended."""
 
@@ -160,6 +165,7 @@ class Forks:
     def close(self) -> None:
         global _address
         _address = ""
+        self._server.terminate()  # programs that still run stay: they have their own ends
         self._server.communicate()
         self._folder.cleanup()
 
