@@ -38,12 +38,19 @@ def holder(fd: int) -> int:
     """The process that has locked this file, 0 when it is unknown: the kernel lists its locks page by page, and
     leaves some out when others come and go meanwhile."""
     found = os.fstat(fd)
-    device = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}"
-    lines = (line.split() for line in Path("/proc/locks").read_text().splitlines())
+    return _listed(Path("/proc/locks").read_text(), found.st_dev, found.st_ino)
+
+
+def _listed(locks: str, device: int, inode: int) -> int:
+    """The process that has locked this file, 0 when the kernel's list does not have it."""
+    lines = (line.split() for line in locks.splitlines())
     pids = {fields[5]: int(fields[4]) for fields in lines if fields[1] == "FLOCK"}
-    exactly = pids.get(f"{device}:{found.st_ino}", 0)
-    # Some file systems give their files another device than they lock them under.
-    return exactly or next((pids[place] for place in pids if place.endswith(f":{found.st_ino}")), 0)
+    exactly = pids.get(f"{os.major(device):02x}:{os.minor(device):02x}:{inode}", 0)
+    if exactly or os.major(device):
+        return exactly  # files of two disks have the same numbers
+    # File systems without a disk of their own may give their files another device than they lock them under.
+    alike = (pids[place] for place in pids if place.startswith("00:") and place.endswith(f":{inode}"))
+    return next(alike, 0)
 
 
 def _may_end(pid: int) -> bool:

@@ -52,6 +52,17 @@ def test_who_was_seen_once_is_named_when_the_list_leaves_it_out(
         locks.lock(file)
 
 
+@pytest.mark.parametrize(("device", "pid"), [((7, 1), 0), ((7, 2), 31), ((0, 0x2B), 32), ((0, 0x2C), 32)])
+def test_a_file_of_the_same_number_on_another_disk_is_another(device: tuple[int, int], pid: int):
+    listed = (
+        "1: FLOCK  ADVISORY  WRITE 31 07:02:13 0 EOF\n"
+        "2: FLOCK  ADVISORY  WRITE 32 00:2b:13 0 EOF\n"
+        "2: -> FLOCK  ADVISORY  WRITE 33 00:2b:13 0 EOF\n"
+        "3: POSIX  ADVISORY  WRITE 34 07:01:13 0 EOF\n"
+    )
+    assert locks._listed(listed, os.makedev(*device), 13) == pid
+
+
 def test_a_lock_is_taken_when_its_holder_has_gone(file: int):
     locks.lock(file)
     with pytest.raises(BlockingIOError), Path(f"/proc/self/fd/{file}").open("rb") as other:

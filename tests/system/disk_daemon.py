@@ -1,12 +1,14 @@
 """A daemon that records in real time with a disk process, without a stand: `python -m tests.system.disk_daemon FOLDER`.
 
 Each 20 ms an event and a frame are published, each 100 ms a line is written into the journal; it says the disk
-process's id, then how much is acknowledged and how old what waits is. SIGTERM ends it, as the end of a run does.
+process's id, then when it looks, how much is acknowledged and how old what waits is. SIGTERM ends it, as the end of a
+run does.
 """
 
 import asyncio
 import signal
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +61,7 @@ async def main(directory):
     while not stopped.is_set():
         since_ns = recorder.waiting_since_ns
         age_s = 0.0 if since_ns is None else (clock.now_ns() - since_ns) / NS_PER_S
-        say(recorder.saved.frames, recorder.saved.telemetry, age_s, recorder.folder_lost)
+        say(time.monotonic(), recorder.saved.frames, recorder.saved.telemetry, age_s, recorder.folder_lost)
         await asyncio.sleep(0.02)
     publishing.cancel()
     patience = Patience()
