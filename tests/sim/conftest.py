@@ -1,0 +1,40 @@
+"""A fake camera that answers at an address of its own, and its client."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.sim.gige.camera import FakeCamera
+from drivers.sim.gige.gvsp_sender import CameraFaults
+from foundation.clock import FollowedClock
+from tests.sim.camera_client import HEIGHT, START_NS, WIDTH, Client, StubPlant, address, render
+
+
+@pytest.fixture
+def plant() -> StubPlant:
+    return StubPlant()
+
+
+@pytest.fixture
+def clock() -> FollowedClock:
+    return FollowedClock(START_NS)
+
+
+@pytest.fixture
+def faults() -> CameraFaults:
+    return CameraFaults()
+
+
+@pytest.fixture
+def camera(plant: StubPlant, clock: FollowedClock, faults: CameraFaults) -> Iterator[FakeCamera]:
+    camera = FakeCamera(plant, clock, render, address(), "SN1", size_px=(WIDTH, HEIGHT), faults=faults)
+    camera.start()
+    yield camera
+    camera.close()
+
+
+@pytest.fixture
+def client(camera: FakeCamera) -> Iterator[Client]:
+    client = Client()
+    yield client
+    client.close()
