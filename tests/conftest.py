@@ -1,6 +1,7 @@
 """What all tests share: the stock camera, and how they are dealt out to the workers."""
 
 import gc
+import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
@@ -22,8 +23,6 @@ _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera
 # In tests/system, whose long runs have each a laboratory of its own, the tests are dealt out one by one but for those
 # of a file that makes something once for all of them, or whose devices have the same serial numbers.
 _DEALT_OUT = PurePath("tests/system")
-# What compiles the marker fit goes first: the workers that need it later find it kept, instead of waiting for it.
-_FIRST = {"tests/compensation/test_markers.py"}
 # A worker that took these last would be the only one at work for a minute.
 _LONG_FILES = {"tests/stand/test_page.py", "tests/stand/test_page_room.py"}
 _TOGETHER = {
@@ -92,9 +91,21 @@ def _forked_programs(runtime_folder: Path) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def compiled_fit(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The machine code that finds markers is there: processes that begin together would each make the same."""
+    _compile(tmp_path_factory.getbasetemp().parent)
+
+
+def _compile(folder: Path) -> None:
     from tests.compensation.conftest import compile_fit
 
-    compile_fit(tmp_path_factory.getbasetemp().parent / "compiling")
+    compile_fit(folder / "compiling")
+
+
+def _compile_first(folder: Path) -> None:
+    """In a process of its own, since OpenCV's threads would not live on in the workers. On a clean checkout it takes
+    half a minute, in which pyright has the other processor; a test in real time would be late beside it."""
+    compiling = multiprocessing.get_context("fork").Process(target=_compile, args=(folder,))
+    compiling.start()
+    compiling.join()
 
 
 @pytest.fixture(scope="session")
@@ -116,8 +127,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     def turn(item: pytest.Item) -> tuple[int, str]:
         file = item.nodeid.partition("::")[0]
-        if file in _FIRST:
-            return 0, file
         return 1 if file in _LONG_FILES or PurePath(file).parent == _DEALT_OUT else 2, file
 
     items.sort(key=turn)
@@ -138,6 +147,8 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     units: dict[str, list[pytest.Item]] = {}
     for item in session.items:
         units.setdefault(_unit(item.nodeid), []).append(item)
+    if any("compiled_fit" in item.fixturenames for item in session.items):  # type: ignore[attr-defined]
+        _compile_first(session.config._tmp_path_factory.getbasetemp())  # type: ignore[attr-defined]
     forks = Forks()
     try:
         run_units(session, list(units.values()), workers)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import itertools
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from markers.detection import detect
 from markers.target import Target
 from recording.format.images import encode_png
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from tests.addresses import WORKER
 
 from .rendered import Scene, photograph, render, true_centres_px
 
@@ -137,9 +139,14 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """The session, not to be changed."""
-    path = tmp_path_factory.mktemp("sessions") / "night"
-    asyncio.run(record(path, {"target.yaml": TARGET_YAML}))
+    """The session, not to be changed. The first worker that needs it records it for all."""
+    folder = tmp_path_factory.getbasetemp().parent if WORKER in os.environ else tmp_path_factory.mktemp("sessions")
+    path, made = folder / "night", folder / "night is recorded"
+    with (folder / "recording").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            asyncio.run(record(path, {"target.yaml": TARGET_YAML}))
+            made.touch()
     return Recorded(path, np.array([true_centres_px(scene_at(index)) for index in range(len(SEQUENCE))]))
 
 
