@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from foundation.clock import NS_PER_S
@@ -156,3 +157,12 @@ def fresh(source, target):
     """A copy of the session `source` in place of whatever is at `target`."""
     shutil.rmtree(target, ignore_errors=True)
     return shutil.copytree(source, target)
+
+
+def hole(begin, end):
+    return lambda data: data[:begin] + bytes(end - begin) + data[end:]
+
+
+def metadata_of(path, name):
+    with path.open("rb") as file:
+        return next(record.metadata for record in make_reader(file).iter_metadata() if record.name == name)

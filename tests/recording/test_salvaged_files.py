@@ -1,0 +1,246 @@
+"""Which files a salvage makes, keeps and removes, whatever lies beside them and wherever it is killed."""
+
+import fcntl
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+from foundation.errors import SessionError
+from recording.format.layout import FRAMES, TELEMETRY
+from recording.reading.session import Session
+from recording.repair.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
+from recording.writing.segment import CommitSink
+from tests.recording.damage import (
+    METADATA,
+    hole,
+    names,
+    read_segment,
+    write_segment,
+)
+
+SERIES = [TELEMETRY, FRAMES]
+
+
+@pytest.mark.parametrize("content", [b"", bytes(5000), b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(5000)])
+def test_a_part_that_never_held_anything_is_removed(damaged, content):
+    folder, _, _ = damaged(FRAMES, lambda data: content)
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.kept, done.messages, done.lost_bytes) == (None, None, 0, 0)
+    assert names(folder) == ["0000.mcap"]
+
+
+def test_an_opening_without_a_message_is_removed(damaged, night):
+    folder, _, _ = damaged(FRAMES, lambda data: data[: night[1][FRAMES, "part"].opening_bytes])
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.kept) == (None, None)
+    assert names(folder) == ["0000.mcap"]
+
+
+def test_the_only_telemetry_is_finished_even_if_it_is_empty_so_that_the_frames_can_be_opened(tmp_path):
+    written = write_segment(tmp_path / TELEMETRY, TELEMETRY, range(1))
+    (tmp_path / TELEMETRY / "0000.mcap.part").write_bytes(written.data[: written.opening_bytes])
+    write_segment(tmp_path / FRAMES, FRAMES, range(2))
+    salvage_session(tmp_path)
+    assert Session.open(tmp_path).frame_count == 2
+
+
+def test_bytes_that_are_no_recording_are_kept(damaged):
+    folder, _, _ = damaged(TELEMETRY, lambda data: b"notes of the night\n" * 50)
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.kept) == (None, folder / "0001.mcap.damaged")
+    assert done.kept.read_bytes() == b"notes of the night\n" * 50
+
+
+def test_beside_its_finished_segment_a_part_that_holds_nothing_more_is_removed(damaged):
+    folder, path, written = damaged(TELEMETRY, lambda data: data)
+    (done,) = salvage_session(folder.parent)
+    for cut in (len(written.data), written.blocks[30].end):
+        path.write_bytes(written.data[:cut])
+        (again,) = salvage_session(folder.parent)
+        assert (again.path, again.kept) == (done.path, None)
+        assert names(folder) == ["0000.mcap", "0001.mcap"]
+        assert read_segment(done.path) == written.messages
+
+
+def test_beside_a_finished_segment_a_part_that_holds_more_replaces_it(damaged, night):
+    cut = night[1][TELEMETRY, "part"].blocks[30].end
+    folder, path, written = damaged(TELEMETRY, lambda data: data[:cut])
+    salvage_session(folder.parent)
+    path.write_bytes(written.data)
+    (done,) = salvage_session(folder.parent)
+    assert (done.path, done.messages, done.kept) == (folder / "0001.mcap", len(written.messages), None)
+    assert read_segment(done.path) == written.messages
+    assert names(folder) == ["0000.mcap", "0001.mcap"]
+
+
+@pytest.mark.parametrize("spoil", [lambda data: data[: len(data) // 3], lambda data: b""])
+def test_beside_a_damaged_finished_segment_the_part_wins(damaged, spoil):
+    folder, path, written = damaged(TELEMETRY, lambda data: data)
+    (done,) = salvage_session(folder.parent)
+    spoiled = spoil(done.path.read_bytes())
+    done.path.write_bytes(spoiled)
+    path.write_bytes(written.data)
+    salvage_session(folder.parent)
+    assert read_segment(done.path) == written.messages
+    assert names(folder)[2:] in (["0001.mcap.damaged"], [])
+    assert (folder / "0001.mcap.damaged").read_bytes() == spoiled
+
+
+def test_beside_a_finished_segment_with_other_messages_the_part_is_kept(damaged, night):
+    folder, path, written = damaged(TELEMETRY, lambda data: data)
+    path.replace(folder / "0000.mcap.part")
+    (done,) = salvage_session(folder.parent)
+    assert (done.source, done.path, done.messages) == (folder / "0000.mcap.part", folder / "0000.mcap", 0)
+    assert done.kept.read_bytes() == written.data
+    assert read_segment(done.path) == night[1][TELEMETRY, "finished"].messages
+
+
+def test_a_living_recording_is_left_alone(damaged):
+    folder, path, written = damaged(FRAMES, lambda data: data[:-5])
+    with path.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        (done,) = salvage_session(folder.parent)
+        assert (done.source, done.path, done.reason) == (path, None, BEING_RECORDED)
+        assert path.read_bytes() == written.data[:-5]
+    (done,) = salvage_session(folder.parent)
+    assert done.path == folder / "0001.mcap"
+
+
+def test_a_copy_that_was_not_finished_is_removed_unless_it_is_being_written(damaged):
+    folder, _, _ = damaged(FRAMES, lambda data: data)
+    copy = folder / "0000.mcap.tmp"
+    copy.write_bytes(b"half a copy")
+    with copy.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        salvage_session(folder.parent)
+        assert copy.exists()
+    salvage_session(folder.parent)
+    assert not copy.exists()
+
+
+@pytest.mark.parametrize("moment", [fcntl.flock, os.replace], ids=["before its lock", "before its final name"])
+def test_the_copy_of_another_salvage_at_work_is_left_alone(damaged, moment):
+    folder, path, written = damaged(FRAMES, lambda data: data)
+    others = []
+
+    def another_salvage(_frame, event, called):
+        if event == "c_call" and called is moment and (folder / "0001.mcap.tmp").exists():
+            sys.setprofile(None)
+            others.extend(salvage_session(folder.parent))
+
+    sys.setprofile(another_salvage)
+    try:
+        (done,) = salvage_session(folder.parent)
+    finally:
+        sys.setprofile(None)
+    assert [(other.source, other.reason) for other in others] == [(path, BEING_RECORDED)]
+    assert (done.path, done.kept) == (folder / "0001.mcap", None)
+    assert read_segment(done.path) == written.messages
+    assert names(folder) == ["0000.mcap", "0001.mcap"]
+
+
+@pytest.mark.parametrize("change", [lambda data: data, hole(9000, 9500)], ids=["whole", "damaged"])
+def test_a_salvage_that_was_killed_at_any_step_is_repeated(damaged, change):
+    folder, path, _ = damaged(FRAMES, change)
+    data = path.read_bytes()
+    (done,) = salvage_session(folder.parent)
+    expected, kept = names(folder), read_segment(done.path)
+    assert salvage_session(folder.parent) == []
+
+    path.write_bytes(data)  # killed before the original went: the copy is there
+    salvage_session(folder.parent)
+    assert [name for name in names(folder) if "damaged" not in name] == ["0000.mcap", "0001.mcap"]
+
+    folder, path, _ = damaged(FRAMES, change)  # killed between the second name and the copy's own
+    if len(expected) == 3:
+        os.link(path, folder / expected[2])
+    (folder / "0001.mcap.tmp").write_bytes(b"half a copy")
+    salvage_session(folder.parent)
+    assert names(folder) == expected
+    assert read_segment(done.path) == kept
+    assert salvage_session(folder.parent) == []
+
+
+@contextmanager
+def small_disk(folder, size_bytes):
+    if os.geteuid():
+        pytest.skip("only root can mount a small disk")
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_bytes}", "tmpfs", folder], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_leaves_the_original_as_it_was(tmp_path, night):
+    data = night[1][FRAMES, "part"].data
+    with small_disk(tmp_path / "disk", len(data) + 20_000) as disk:
+        (disk / "night" / FRAMES).mkdir(parents=True)
+        part = disk / "night" / FRAMES / "0000.mcap.part"
+        part.write_bytes(data)
+        with pytest.raises(SessionError, match=r"cannot be salvaged and is left as it was .*No space left"):
+            salvage_unfinished(disk)
+        assert names(disk) == ["night/frames/0000.mcap.part"]
+        assert part.read_bytes() == data
+
+
+def test_what_a_dead_recorder_had_reserved_is_room_for_the_copy(tmp_path, night):
+    data = night[1][FRAMES, "part"].data
+    disk_bytes = 4 * len(data)
+    with small_disk(tmp_path / "disk", disk_bytes) as disk:
+        (disk / "night" / FRAMES).mkdir(parents=True)
+        sink = CommitSink(disk / "night" / FRAMES / "0000.mcap.part", disk_bytes - 20_000)
+        sink.append([data])
+        sink.close()
+        (done,) = salvage_unfinished(disk)
+        assert read_segment(done.path) == night[1][FRAMES, "part"].messages
+
+
+def write_with_attachment(path, attached):
+    """A telemetry segment with a binary attachment before its metadata; where that begins."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        begin = file.tell()
+        writer.add_attachment(0, 0, "earlier.mcap", "application/octet-stream", attached)
+        writer.add_metadata("session", METADATA)
+        channel = writer.register_channel("/x", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        for index in range(50):
+            writer.add_message(channel, index, b"%d" % index, index)
+        writer.finish()
+    return begin
+
+
+@pytest.mark.parametrize("place", [None, 0, 40, 3000], ids=["whole", "head", "name", "content"])
+def test_an_attached_recording_is_not_taken_for_this_one(tmp_path, night, place):
+    (tmp_path / TELEMETRY).mkdir()
+    part = tmp_path / TELEMETRY / "0000.mcap.part"
+    begin = write_with_attachment(part, night[1][TELEMETRY, "finished"].data)
+    if place is not None:
+        part.write_bytes(hole(begin + place, begin + place + 8)(part.read_bytes()))
+    (done,) = salvage_session(tmp_path)
+    assert [record.topic for record in read_segment(done.path)] == ["/x"] * 50
+
+
+def test_the_start_of_the_daemon_looks_at_unfinished_segments_only(damaged):
+    assert salvage_unfinished(Path("/nowhere")) == []
+    folder, _, _ = damaged(FRAMES, lambda data: data[:-5])
+    (folder / "0000.mcap").write_bytes(b"damaged")
+    outside = folder.parent / "other"
+    outside.mkdir()
+    (outside / "0000.mcap.part").write_bytes(b"no series of ours")
+    results = salvage_unfinished(folder.parent.parent)
+    assert folder / "0001.mcap.part" in [done.source for done in results]
+    assert (folder / "0000.mcap").read_bytes() == b"damaged"
+    assert (outside / "0000.mcap.part").exists()
+
+
+def test_a_directory_that_is_no_session_is_refused(tmp_path):
+    with pytest.raises(SessionError, match="not a session"):
+        salvage_session(tmp_path)
