@@ -125,9 +125,9 @@ def _unit(nodeid: str) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The long ones early: those that wait in real time leave the processors to others, and no worker ends with one."""
 
-    def turn(item: pytest.Item) -> tuple[int, str]:
+    def turn(item: pytest.Item) -> tuple[bool, str]:
         file = item.nodeid.partition("::")[0]
-        return 1 if file in _LONG_FILES or PurePath(file).parent == _DEALT_OUT else 2, file
+        return file not in _LONG_FILES and PurePath(file).parent != _DEALT_OUT, file
 
     items.sort(key=turn)
 

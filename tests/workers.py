@@ -55,6 +55,8 @@ def _write_in_one_place(config: pytest.Config) -> None:
 class _Worker:
     number: int
     process: int
+    end: int
+    """Can be read once the process has ended (pidfd), also while a process that a test has left holds its line."""
     left: list[pytest.Item]
     """Of the unit that it has begun."""
 
@@ -77,13 +79,16 @@ class _Crew:
                 other.close()
             _work(_Task(self._session, end, self._units, self._queue), number, first)
         end.close()
-        self._members[line] = _Worker(number, process, first)
+        self._members[line] = _Worker(number, process, os.pidfd_open(process), first)
 
     def hear_all(self) -> None:
         """Report what they do until all have ended."""
         while self._members:
-            for line in wait(list(self._members)):
-                self._hear(cast(Connection, line))
+            lines = {worker.end: line for line, worker in self._members.items()}
+            for ready in wait([*lines, *lines.values()]):
+                line = lines[ready] if isinstance(ready, int) else cast(Connection, ready)
+                if line in self._members and (line is ready or not line.poll()):
+                    self._hear(line, has_ended=line is not ready)
             if self._session.shouldfail or self._session.shouldstop:
                 self._drain()
 
@@ -92,6 +97,7 @@ class _Crew:
         self._drain()
         for line, worker in self._members.items():
             line.close()
+            os.close(worker.end)
             os.waitpid(worker.process, 0)
         os.close(self._queue)
 
@@ -99,11 +105,12 @@ class _Crew:
         while os.read(self._queue, 4096):
             pass
 
-    def _hear(self, line: Connection) -> None:
+    def _hear(self, line: Connection, *, has_ended: bool) -> None:
         hook, worker = self._session.config.hook, self._members[line]
         word, value = "end", None
-        with suppress(EOFError):
-            word, value = line.recv()
+        if not has_ended:
+            with suppress(EOFError, ConnectionResetError):
+                word, value = line.recv()
         if word == "unit":
             worker.left = list(self._units[cast(int, value)])
         elif word == "begins":
@@ -121,6 +128,7 @@ class _Crew:
         """Where it ended amid a unit, its test has failed and another takes the tests after it."""
         del self._members[line]
         line.close()
+        os.close(worker.end)
         status = os.waitstatus_to_exitcode(os.waitpid(worker.process, 0)[1])
         if not worker.left:
             return
