@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar, cast, get_type_hints
 
 import typer
 
+from foundation.exit_codes import one_line_errors
 from foundation.output import Output, outputting
 from foundation.usage import OneLineUsage, VersionOption
 
@@ -27,7 +28,8 @@ _COMMON: dict[str, Any] = {
 
 
 class App(typer.Typer):
-    """Every command has -q, -v, --version and --json, which `foundation.output` knows of."""
+    """Every command has -q, -v, --version and --json, which `foundation.output` knows of, and ends as `exit_codes` has
+    it."""
 
     def __init__(self, help: str | None = None, *, no_args_is_help: bool = False) -> None:  # noqa: A002 - as in typer
         own: dict[str, Any] = {} if help is None else {"help": help}  # else it is that of the callback
@@ -64,13 +66,13 @@ def _with_group(function: Callable[..., Any], group: str, kind: type[Any]) -> Ca
 
 
 def _with_common(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` with the common options behind its own."""
+    """`function` with the common options behind its own; what it raises becomes its sentence and its exit status."""
 
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
         asked = {name: bool(options.pop(name, False)) for name in _COMMON}
         wanted = Output(asked["common_quiet"], asked["common_verbose"], asked["common_json"])
-        with outputting(wanted):
+        with outputting(wanted), one_line_errors():
             return function(*args, **options)
 
     return with_parameters(command, function, {name: (kind, False) for name, kind in _COMMON.items()})

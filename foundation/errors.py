@@ -10,6 +10,7 @@
     │   ├── DeviceFault        the device works and reports trouble: sensor break, jam, alarm
     │   ├── Occupied           operated at the unit by hand; it takes no orders until that ends
     │   └── Superseded         a newer command, or making safe, has overtaken this one: not a fault
+    ├── Interrupted            the operator ended the run
     ├── StandTripped           the guard has made the stand safe; an operator must clear it
     ├── SessionError           a recorded session cannot be read
     ├── DetectionError         no target in the image, or one that is not identified beyond doubt
@@ -72,6 +73,11 @@ class Occupied(DeviceError):
 
 class Superseded(DeviceError):
     """A newer command, or making safe, has taken the actuator over; what was asked for before was not carried out."""
+
+
+class Interrupted(StandError):
+    """The operator ended the run (Ctrl-C, SIGTERM or `stand stop`); the text says whether the stand confirmed its safe
+    state."""
 
 
 class StandTripped(StandError):

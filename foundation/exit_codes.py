@@ -9,9 +9,9 @@ from contextlib import contextmanager
 
 import typer
 
-from foundation.errors import ConfigError, StandError
+from foundation.errors import ConfigError, Interrupted, StandError
 from foundation.output import output
-from foundation.usage import tell
+from foundation.usage import one_line, tell
 
 FAILED = 1
 BAD_INPUT = 2
@@ -29,6 +29,9 @@ def one_line_errors() -> Generator[None]:
         raise typer.Exit(BAD_INPUT) from error
     except BrokenPipeError:  # the reader of our output has closed it; typer ends quietly
         raise
+    except Interrupted as error:
+        typer.echo(one_line(error), err=True)
+        raise typer.Exit(INTERRUPTED) from error
     except (StandError, OSError) as error:
         _tell(error)
         raise typer.Exit(FAILED) from error

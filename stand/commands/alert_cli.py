@@ -8,7 +8,6 @@ import typer
 
 from foundation.command_app import App
 from foundation.errors import ConfigError, StandError
-from foundation.exit_codes import one_line_errors
 from foundation.output import show
 from foundation.usage import one_line
 
@@ -37,19 +36,18 @@ def try_them(
     from stand.serving.alerts import check_alerts
     from stand.serving.alerts_process import deliver, ping
 
-    with one_line_errors():
-        stand = load_config(packaged("", config))
-        if stand.alerts.secrets is None:
-            raise ConfigError(f"{config}: has no alerts.secrets; name a file with `urls:` there (docs/safety.md)")
-        check_alerts(stand.alerts)
-        found = load_secrets(stand.alerts.secrets)
-        text = "This is a test: alerts of this stand arrive here."
-        failures = [said for _, said in deliver(stand.alerts.secrets, f"{stand.name}: test", text, _LIMIT_S)]
-        failures += [failure] if (failure := ping(stand.alerts.secrets, _LIMIT_S)) else []
-        for failure in failures:
-            typer.echo(one_line(failure), err=True)
-        if failures:
-            raise StandError(f"{len(failures)} of {len(found.urls) + bool(found.alive_url)} were not reached")
-        alive = ", and the sign of life was taken" if found.alive_url else "; no alive_url is given"
-        line = f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}"
-        show({"receivers": len(found.urls), "alive": bool(found.alive_url)}, [line])
+    stand = load_config(packaged("", config))
+    if stand.alerts.secrets is None:
+        raise ConfigError(f"{config}: has no alerts.secrets; name a file with `urls:` there (docs/safety.md)")
+    check_alerts(stand.alerts)
+    found = load_secrets(stand.alerts.secrets)
+    text = "This is a test: alerts of this stand arrive here."
+    failures = [said for _, said in deliver(stand.alerts.secrets, f"{stand.name}: test", text, _LIMIT_S)]
+    failures += [failure] if (failure := ping(stand.alerts.secrets, _LIMIT_S)) else []
+    for failure in failures:
+        typer.echo(one_line(failure), err=True)
+    if failures:
+        raise StandError(f"{len(failures)} of {len(found.urls) + bool(found.alive_url)} were not reached")
+    alive = ", and the sign of life was taken" if found.alive_url else "; no alive_url is given"
+    line = f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}"
+    show({"receivers": len(found.urls), "alive": bool(found.alive_url)}, [line])

@@ -14,8 +14,8 @@ from foundation.clock import WallClock
 from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.errors import ConfigError
-from foundation.exit_codes import FAILED, INTERRUPTED, one_line_errors
-from foundation.output import output, say, show
+from foundation.exit_codes import FAILED
+from foundation.output import output, show
 from foundation.usage import one_line
 from stand.commands.reached import ConfigOption
 from stand.commissioning.commissioning import commission
@@ -23,7 +23,6 @@ from stand.commissioning.finding import Finding, worst
 from stand.commissioning.genicam_rehearsal import rehearse
 from stand.commissioning.record import Record
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.opening.stop import Interrupted
 from stand.running.order import register_texts
 
 app = App()
@@ -51,28 +50,23 @@ def check(
 
     Example: stand check --config my-stand.yaml --moves
     """
-    with one_line_errors():
-        path = packaged("", config)
-        stand = load_config(path)
-        if genicam is not None:
-            _rehearse(genicam, None if _is_installed(path) else stand)
-            return
-        texts = {"config.yaml": read_document(path), **register_texts(stand)}
-        clock = WallClock()
-        began_ns = clock.now_ns()
-        try:
-            found, identities = asyncio.run(commission(stand, _nothing if output().as_json else _tell, has_moves=moves))
-        except Interrupted as error:
-            say(error)
-            raise typer.Exit(INTERRUPTED) from error
-        record = Record(stand, str(path), texts, began_ns, clock.now_ns(), moves, found, identities)
-        kept = "not kept, since this is an installed file; copy it to have a stand of your own"
-        if not _is_installed(path):
-            _, page = record.write(path)
-            kept = f"kept as {page}"
-        show(record.data(), [one_line(_summary(found, kept, moves=moves))])
-        if worst(found) == "failed":
-            raise typer.Exit(FAILED)
+    path = packaged("", config)
+    stand = load_config(path)
+    if genicam is not None:
+        _rehearse(genicam, None if _is_installed(path) else stand)
+        return
+    texts = {"config.yaml": read_document(path), **register_texts(stand)}
+    clock = WallClock()
+    began_ns = clock.now_ns()
+    found, identities = asyncio.run(commission(stand, _nothing if output().as_json else _tell, has_moves=moves))
+    record = Record(stand, str(path), texts, began_ns, clock.now_ns(), moves, found, identities)
+    kept = "not kept, since this is an installed file; copy it to have a stand of your own"
+    if not _is_installed(path):
+        _, page = record.write(path)
+        kept = f"kept as {page}"
+    show(record.data(), [one_line(_summary(found, kept, moves=moves))])
+    if worst(found) == "failed":
+        raise typer.Exit(FAILED)
 
 
 def _rehearse(file: Path, stand: StandConfig | None) -> None:

@@ -14,7 +14,6 @@ from drivers.wires.registers import RegisterMap
 from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.files import write_whole
 from foundation.output import say, show
 from foundation.schemas import write_schemas
@@ -49,23 +48,22 @@ def migrate(
 
     Example: stand config migrate my-stand.yaml
     """
-    with one_line_errors():
-        text = read_document(file)
-        found = migrated(text, str(file))
-        if found is None:
-            show({"file": None}, [f"{file}: has today's form already; nothing was written"])
-            return
-        place = out or file.resolve()
-        if out is None:
-            kept = place.with_name(f"{place.name}.before")
-            if kept.exists():
-                raise ConfigError(f"{kept}: is there already; move it away, or name another place with --out")
-            write_whole(kept, text)
-        write_whole(place, found.text)
-        lost = list(found.without_comments_of)
-        show({"file": place, "without_comments": lost}, [place])
-        for section in lost:
-            say(f"comments were not kept in: {section}")
+    text = read_document(file)
+    found = migrated(text, str(file))
+    if found is None:
+        show({"file": None}, [f"{file}: has today's form already; nothing was written"])
+        return
+    place = out or file.resolve()
+    if out is None:
+        kept = place.with_name(f"{place.name}.before")
+        if kept.exists():
+            raise ConfigError(f"{kept}: is there already; move it away, or name another place with --out")
+        write_whole(kept, text)
+    write_whole(place, found.text)
+    lost = list(found.without_comments_of)
+    show({"file": place, "without_comments": lost}, [place])
+    for section in lost:
+        say(f"comments were not kept in: {section}")
 
 
 @app.command()
@@ -79,6 +77,5 @@ def schema(
 
     Example: stand config schema --out schema
     """
-    with one_line_errors():
-        written = list(write_schemas(out or packaged("", "simulated").parent / "schema", DOCUMENTS))
-        show(written, written)
+    written = list(write_schemas(out or packaged("", "simulated").parent / "schema", DOCUMENTS))
+    show(written, written)

@@ -12,7 +12,6 @@ from drivers.wires.camera_settings import GigeCameraSettings
 from drivers.wires.discovery import FoundCamera, SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.output import show
 from foundation.usage import one_line
 from stand.config.stand_config import load_config, packaged
@@ -38,20 +37,19 @@ def devices(
 
     Example: stand devices --ask 169.254.255.255
     """
-    with one_line_errors():
-        addresses = list(ask or ())
-        if config is not None:
-            stand = load_config(packaged("", config))
-            gige = (camera for camera in stand.cameras.values() if isinstance(camera, GigeCameraSettings))
-            addresses += [camera.address for camera in gige]
-        try:
-            cameras = asyncio.run(cameras_at(addresses, wait_s)) if addresses else ()
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"cameras cannot be asked at {', '.join(addresses)}: {error}") from error
-        ports, usb = serial_ports(), usb_devices()
-        found = {"serial": ports, "usb": usb, "cameras": cameras}
-        data = {kind: [asdict(each) for each in some] for kind, some in found.items()}
-        show(data, map(one_line, _lines(ports, usb, cameras, addresses)))
+    addresses = list(ask or ())
+    if config is not None:
+        stand = load_config(packaged("", config))
+        gige = (camera for camera in stand.cameras.values() if isinstance(camera, GigeCameraSettings))
+        addresses += [camera.address for camera in gige]
+    try:
+        cameras = asyncio.run(cameras_at(addresses, wait_s)) if addresses else ()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cameras cannot be asked at {', '.join(addresses)}: {error}") from error
+    ports, usb = serial_ports(), usb_devices()
+    found = {"serial": ports, "usb": usb, "cameras": cameras}
+    data = {kind: [asdict(each) for each in some] for kind, some in found.items()}
+    show(data, map(one_line, _lines(ports, usb, cameras, addresses)))
 
 
 def _lines(

@@ -15,7 +15,6 @@ import typer
 from drivers.wires.discovery import SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.output import say, show
 from foundation.usage import one_line
 from stand.config.new_stand import Axis, Connected, new_stand
@@ -51,19 +50,18 @@ def init(
 
     Example: stand init my-stand --bus /dev/serial/by-id/usb-FTDI-port0 --camera 192.168.10.2
     """
-    with one_line_errors():
-        given = Connected(bus, flap, camera, "", tuple(map(_axis, axis or ())))
-        if simulated and given != Connected():
-            raise ConfigError("--simulated has devices of its own; leave --bus, --flap, --camera and --axis out")
-        is_asked = ask and not simulated and _is_terminal()
-        connected = None if simulated else _identified(_asked(given) if is_asked else given)
-        texts = new_stand(name or directory.absolute().name, connected)
-        _check(texts)
-        written = _write(directory, texts)
-        show({"written": written}, written)
-        for what in _missing(connected):
-            say(f"{directory / 'stand.yaml'}: {what} is still to be written; `stand devices` shows what there is")
-        say(f"now: stand plan {directory / 'recipe.yaml'} --config {directory / 'stand.yaml'}")
+    given = Connected(bus, flap, camera, "", tuple(map(_axis, axis or ())))
+    if simulated and given != Connected():
+        raise ConfigError("--simulated has devices of its own; leave --bus, --flap, --camera and --axis out")
+    is_asked = ask and not simulated and _is_terminal()
+    connected = None if simulated else _identified(_asked(given) if is_asked else given)
+    texts = new_stand(name or directory.absolute().name, connected)
+    _check(texts)
+    written = _write(directory, texts)
+    show({"written": written}, written)
+    for what in _missing(connected):
+        say(f"{directory / 'stand.yaml'}: {what} is still to be written; `stand devices` shows what there is")
+    say(f"now: stand plan {directory / 'recipe.yaml'} --config {directory / 'stand.yaml'}")
 
 
 def _is_terminal() -> bool:

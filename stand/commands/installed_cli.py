@@ -8,7 +8,6 @@ from pathlib import Path
 import yaml
 
 from foundation.command_app import App
-from foundation.exit_codes import one_line_errors
 from foundation.output import show
 from foundation.usage import one_line
 
@@ -34,11 +33,10 @@ def configs() -> None:
 
 
 def _list(folder: str, described_by: str) -> None:
-    with one_line_errors():
-        found: list[dict[str, str]] = []
-        for path in sorted((Path(str(importlib.resources.files("configs"))) / folder).glob("*.yaml")):
-            data: object = yaml.safe_load(path.read_text(encoding="utf-8"))
-            text = str(data.get(described_by, "")) if isinstance(data, dict) else ""
-            found.append({"name": path.stem, "text": text, "path": str(path)})
-        width = max((len(each["name"]) for each in found), default=0)
-        show(found, (one_line(f"{each['name']:<{width}}  {each['text']}") for each in found))
+    found: list[dict[str, str]] = []
+    for path in sorted((Path(str(importlib.resources.files("configs"))) / folder).glob("*.yaml")):
+        data: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = str(data.get(described_by, "")) if isinstance(data, dict) else ""
+        found.append({"name": path.stem, "text": text, "path": str(path)})
+    width = max((len(each["name"]) for each in found), default=0)
+    show(found, (one_line(f"{each['name']:<{width}}  {each['text']}") for each in found))

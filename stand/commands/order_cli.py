@@ -14,7 +14,6 @@ from pydantic import JsonValue
 
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import one_line_errors
 from foundation.output import say, show
 from foundation.usage import one_line
 from stand.commands.reached import ConfigOption, DirectoryOption, TokenOption, UrlOption, on_stand, reached
@@ -65,16 +64,15 @@ def device(
 
     Example: stand device flap open
     """
-    with one_line_errors():
-        given = dict(map(_argument, arguments or ()))
-        try:
-            server = reached(directory, config, url, token_file)
-        except SessionError:
-            if url or directory is not None:
-                raise
-            _without_daemon(config, name, verb, given, out)
-            return
-        _by_daemon(server, name, verb, given)
+    given = dict(map(_argument, arguments or ()))
+    try:
+        server = reached(directory, config, url, token_file)
+    except SessionError:
+        if url or directory is not None:
+            raise
+        _without_daemon(config, name, verb, given, out)
+        return
+    _by_daemon(server, name, verb, given)
 
 
 def _by_daemon(server: Server, name: str, verb: str, arguments: dict[str, object]) -> None:

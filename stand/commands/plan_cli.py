@@ -15,7 +15,6 @@ from experiments.steps import Step, kind_of, parameters_of
 from foundation.clock import NS_PER_S, WallClock
 from foundation.command_app import App
 from foundation.ending import Ending
-from foundation.exit_codes import one_line_errors
 from foundation.output import say, show
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.absent import absences
@@ -42,37 +41,36 @@ def plan(
 
     Example: stand plan thermal-cycle --json
     """
-    with one_line_errors():
-        order = load_order(recipe, config)
-        learned = load_learned(order.config.recording.directory)
-        night = price_night(tuple(order.recipe.plan()), order.config, order.config.recording.directory)
-        steps, total_s = night.steps, night.duration_s
-        now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
-        end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
-        totals = {
-            "duration_s": total_s,
-            "after_s": night.after_s,
-            "frames": sum(step.frames for step in steps),
-            "bytes": round(sum(step.size_bytes for step in steps)),
-            "end": end,
-        }
-        back = [f"then back to the laboratory's temperature, {_hours(night.after_s)}"] if night.after_s else []
-        total = (
-            f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
-            f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
-        )
-        lines = camera_lines(order.config)
-        looks = looks_of(step.planned for step in steps)
-        data = {
-            "steps": [step.as_json() for step in steps],
-            **totals,
-            "cameras": [asdict(line) for line in lines],
-            "looks": None if looks is None else asdict(looks),
-            "absent": (absent := absences(order.config)),
-        }
-        shared = [str(line) for line in lines if line.shared_by > 1]
-        seen = [] if looks is None else [str(looks)]
-        show(data, [*map(_line, steps), *back, total, *seen, str(learned), *shared, *absent])
+    order = load_order(recipe, config)
+    learned = load_learned(order.config.recording.directory)
+    night = price_night(tuple(order.recipe.plan()), order.config, order.config.recording.directory)
+    steps, total_s = night.steps, night.duration_s
+    now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
+    end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
+    totals = {
+        "duration_s": total_s,
+        "after_s": night.after_s,
+        "frames": sum(step.frames for step in steps),
+        "bytes": round(sum(step.size_bytes for step in steps)),
+        "end": end,
+    }
+    back = [f"then back to the laboratory's temperature, {_hours(night.after_s)}"] if night.after_s else []
+    total = (
+        f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
+        f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
+    )
+    lines = camera_lines(order.config)
+    looks = looks_of(step.planned for step in steps)
+    data = {
+        "steps": [step.as_json() for step in steps],
+        **totals,
+        "cameras": [asdict(line) for line in lines],
+        "looks": None if looks is None else asdict(looks),
+        "absent": (absent := absences(order.config)),
+    }
+    shared = [str(line) for line in lines if line.shared_by > 1]
+    seen = [] if looks is None else [str(looks)]
+    show(data, [*map(_line, steps), *back, total, *seen, str(learned), *shared, *absent])
 
 
 @app.command()
@@ -88,18 +86,17 @@ def simulate(
 
     Example: stand simulate --fault bus.drop=0.1@60:30 & stand run demo
     """
-    with one_line_errors():
-        if faults:
-            rows = list_faults()
-            show(rows, (f"{row['name']:<32}{json.dumps(row['worst']):<18}{row['text']}" for row in rows))
-            return
-        stand_config = load_config(packaged("", config))
-        laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
-        planned = (*(stand_config.simulation.faults if stand_config.simulation else ()), *(fault or ()))
-        simulator = Simulator({**laboratory, "faults": list(planned)})
-        say(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it")
-        ending.wait()
-        simulator.stop()
+    if faults:
+        rows = list_faults()
+        show(rows, (f"{row['name']:<32}{json.dumps(row['worst']):<18}{row['text']}" for row in rows))
+        return
+    stand_config = load_config(packaged("", config))
+    laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
+    planned = (*(stand_config.simulation.faults if stand_config.simulation else ()), *(fault or ()))
+    simulator = Simulator({**laboratory, "faults": list(planned)})
+    say(f"the laboratory of {stand_config.name} answers; Ctrl-C ends it")
+    ending.wait()
+    simulator.stop()
 
 
 def _line(step: PricedStep) -> str:

@@ -11,7 +11,8 @@ import typer
 
 from foundation.clock import WallClock
 from foundation.command_app import App
-from foundation.exit_codes import INTERRUPTED, one_line_errors
+from foundation.errors import Interrupted
+from foundation.exit_codes import INTERRUPTED
 from foundation.instants import date_time, duration
 from foundation.output import say, show
 from foundation.usage import one_line
@@ -21,7 +22,6 @@ from stand.queueing import queue
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_run import conclude, run_entry
 from stand.queueing.queue_work import Notes, work
-from stand.running.opening.stop import Interrupted
 from stand.serving.desk import QueuedRun
 
 app = App(
@@ -110,27 +110,26 @@ def start(
 
     Example: stand queue start --out /data/sessions
     """
-    with one_line_errors():
-        directory = directory_of(config, out)
-        if not queue.queued(directory).entries:
-            show(_as_json("", ()), ())
-            say(f"{directory}: nothing is queued there")
-            return
-        if clear:
-            queue.clear(directory)
+    directory = directory_of(config, out)
+    if not queue.queued(directory).entries:
+        show(_as_json("", ()), ())
+        say(f"{directory}: nothing is queued there")
+        return
+    if clear:
+        queue.clear(directory)
 
-        async def run_one(entry: Entry, notes: Notes) -> Path:
-            session = await run_entry(directory, entry, notes, virtual_time=virtual_time)
-            await asyncio.to_thread(conclude, entry, session, say, report=report)
-            return session
+    async def run_one(entry: Entry, notes: Notes) -> Path:
+        session = await run_entry(directory, entry, notes, virtual_time=virtual_time)
+        await asyncio.to_thread(conclude, entry, session, say, report=report)
+        return session
 
-        try:
-            asyncio.run(work(directory, run_one, WallClock(), say))
-        except Interrupted as error:
-            raise typer.Exit(INTERRUPTED) from error  # its end has been reported
-        finally:
-            left = queue.queued(directory)
-            show(_as_json(left.halted, left.entries), ())
+    try:
+        asyncio.run(work(directory, run_one, WallClock(), say))
+    except Interrupted as error:
+        raise typer.Exit(INTERRUPTED) from error  # its end has been reported
+    finally:
+        left = queue.queued(directory)
+        show(_as_json(left.halted, left.entries), ())
 
 
 def _as_json(halted: str, runs: Sequence[Entry | QueuedRun]) -> dict[str, object]:

@@ -13,7 +13,6 @@ import typer
 from foundation.clock import WallClock
 from foundation.command_app import with_parameters
 from foundation.errors import ConfigError, InUse, SessionError
-from foundation.exit_codes import one_line_errors
 from foundation.output import say
 from stand.commands.reached import ConfigOption, TokenOption, UrlOption
 from stand.commands.submitted import submit_recipe
@@ -140,12 +139,10 @@ def directory_of(config: str, out: Path | None) -> Path:
 
 
 def at_door(function: Callable[..., None]) -> Callable[..., None]:
-    """A command whose first parameter is the Door it goes through: what finds that is taken from the command line.
-    Errors become sentences."""
+    """A command whose first parameter is the Door it goes through: what finds that is taken from the command line."""
 
     def command(*arguments: Any, config: str, out: Path | None, url: str, token_file: Path | None, **more: Any) -> None:
-        with one_line_errors():
-            function(door(config, out, url, token_file), *arguments, **more)
+        function(door(config, out, url, token_file), *arguments, **more)
 
     command.__name__, command.__doc__ = function.__name__, function.__doc__
     found_by: dict[str, tuple[Any, object]] = {

@@ -11,7 +11,6 @@ import typer
 
 from foundation.command_app import with_parameters
 from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import one_line_errors
 from stand.serving.client import Server, running_sessions, server_at, server_of
 
 DirectoryArgument = Annotated[
@@ -41,16 +40,14 @@ def on_stand(
     *, anywhere: bool = False, by_option: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A command whose first parameter is the Server it is for: what finds that is taken from the command line instead.
-    anywhere: as `reached` has it. by_option: the folder is an option, since the command has arguments of its own.
-    Errors become sentences."""
+    anywhere: as `reached` has it. by_option: the folder is an option, since the command has arguments of its own."""
 
     def take(function: Command) -> Command:
         @functools.wraps(function)
         def command(
             *arguments: Any, directory: Path | None, config: str, url: str, token_file: Path | None, **options: Any
         ) -> None:
-            with one_line_errors():
-                function(reached(directory, config, url, token_file, anywhere=anywhere), *arguments, **options)
+            function(reached(directory, config, url, token_file, anywhere=anywhere), *arguments, **options)
 
         added = {"directory": (DirectoryOption if by_option else DirectoryArgument, None), **_OPTIONS}
         return with_parameters(command, function, added, without="server")

@@ -6,8 +6,7 @@ import asyncio
 import itertools
 import shutil
 import tempfile
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -16,9 +15,9 @@ import typer
 
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import INTERRUPTED, NOT_REPORTED, one_line_errors
+from foundation.exit_codes import NOT_REPORTED
 from foundation.output import output, say, show
-from foundation.usage import one_line, tell
+from foundation.usage import tell
 from recording.repair.salvage import salvage_line
 from stand.commands.checked_cli import warn_unchecked
 from stand.commands.reached import TokenOption, UrlOption
@@ -27,7 +26,6 @@ from stand.config.checked import load_checked
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.learned import learn
 from stand.estimating.run_estimate import existing, price_night, small_disk
-from stand.running.opening.stop import Interrupted
 from stand.running.order import load_order
 from stand.running.resume import interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
@@ -57,14 +55,13 @@ def demo(
 
     Example: stand demo --out /tmp/demo
     """
-    with _run_errors():
-        order = load_order("demo", "simulated")
-        directory = _unused(out)
-        _check_writable(directory)
-        night = price_night(tuple(order.recipe.plan()), order.config, directory)
-        with followed(order, night, directory, is_virtual=True) as watch:
-            session = asyncio.run(run_virtual(order, directory, None, watch))
-        _show_session(session, directory, f"session  {session}", report=True)
+    order = load_order("demo", "simulated")
+    directory = _unused(out)
+    _check_writable(directory)
+    night = price_night(tuple(order.recipe.plan()), order.config, directory)
+    with followed(order, night, directory, is_virtual=True) as watch:
+        session = asyncio.run(run_virtual(order, directory, None, watch))
+    _show_session(session, directory, f"session  {session}", report=True)
 
 
 @app.command()
@@ -93,31 +90,30 @@ def run(
 
     Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions --report
     """
-    with _run_errors():
-        if url:
-            _check_elsewhere({"--virtual-time": virtual_time, "--seed": seed, "--out": out, "--report": report})
-            there = server_at(url, token_file)
-            return _follow(there, submit_recipe(there, recipe, attended=attended), detach=detach, report=False)
-        _check_seed(seed, virtual_time=virtual_time)
-        order = replace(load_order(recipe, config), attended=attended)
-        if report:
-            check_reportable(order.recipe.plan())
-        if not virtual_time:
-            path = packaged("", config)
-            warn_unchecked(path, order.config, load_checked(path))
-        if not virtual_time and (server := daemon_of(order.config)) is not None:
-            return _follow(server, submit(server, order, out), detach=detach, report=report)
-        if detach:
-            raise ConfigError("--detach: no `stand serve` has this stand, and a run by itself ends with its command")
-        directory = out or order.config.recording.directory
-        _check_writable(directory)
-        night = price_night(tuple(order.recipe.plan()), order.config, directory)
-        if lack := small_disk(shutil.disk_usage(existing(directory)).free, night.steps, order.config):
-            say(f"warning: {directory}: {lack}")
-        with followed(order, night, directory, is_virtual=virtual_time) as watch:
-            work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
-            session = asyncio.run(work)
-        _finished(session, order.config, report=report)
+    if url:
+        _check_elsewhere({"--virtual-time": virtual_time, "--seed": seed, "--out": out, "--report": report})
+        there = server_at(url, token_file)
+        return _follow(there, submit_recipe(there, recipe, attended=attended), detach=detach, report=False)
+    _check_seed(seed, virtual_time=virtual_time)
+    order = replace(load_order(recipe, config), attended=attended)
+    if report:
+        check_reportable(order.recipe.plan())
+    if not virtual_time:
+        path = packaged("", config)
+        warn_unchecked(path, order.config, load_checked(path))
+    if not virtual_time and (server := daemon_of(order.config)) is not None:
+        return _follow(server, submit(server, order, out), detach=detach, report=report)
+    if detach:
+        raise ConfigError("--detach: no `stand serve` has this stand, and a run by itself ends with its command")
+    directory = out or order.config.recording.directory
+    _check_writable(directory)
+    night = price_night(tuple(order.recipe.plan()), order.config, directory)
+    if lack := small_disk(shutil.disk_usage(existing(directory)).free, night.steps, order.config):
+        say(f"warning: {directory}: {lack}")
+    with followed(order, night, directory, is_virtual=virtual_time) as watch:
+        work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
+        session = asyncio.run(work)
+    _finished(session, order.config, report=report)
 
 
 def _check_elsewhere(given: Mapping[str, object]) -> None:
@@ -152,27 +148,26 @@ def resume_run(
 
     Example: stand resume sessions/20260101T180000Z-thermal-cycle --config laboratory.yaml
     """
-    with _run_errors():
-        before = interruption(directory, load_config(packaged("", config)), clear=clear)
-        order = replace(before.order, attended=attended)
-        before = replace(before, order=order)
-        try:
-            if report:
-                check_reportable(order.recipe.plan())
-            for segment in before.salvaged:
-                typer.echo(salvage_line(segment), err=True)
-            night = price_night(before.state.plan, order.config, before.directory.parent)
-        except BaseException:
-            before.release()
-            raise
-        is_virtual = is_of_virtual_time(before)
-        if not is_virtual and (server := daemon_of(order.config)) is not None:
-            before.release()
-            _resume_there(server, directory, attended=attended, report=report)
-            return
-        with followed(order, night, directory, is_virtual=is_virtual, before=before) as watch:
-            session = asyncio.run(resume(before, watch))
-        _finished(session, order.config, report=report)
+    before = interruption(directory, load_config(packaged("", config)), clear=clear)
+    order = replace(before.order, attended=attended)
+    before = replace(before, order=order)
+    try:
+        if report:
+            check_reportable(order.recipe.plan())
+        for segment in before.salvaged:
+            typer.echo(salvage_line(segment), err=True)
+        night = price_night(before.state.plan, order.config, before.directory.parent)
+    except BaseException:
+        before.release()
+        raise
+    is_virtual = is_of_virtual_time(before)
+    if not is_virtual and (server := daemon_of(order.config)) is not None:
+        before.release()
+        _resume_there(server, directory, attended=attended, report=report)
+        return
+    with followed(order, night, directory, is_virtual=is_virtual, before=before) as watch:
+        session = asyncio.run(resume(before, watch))
+    _finished(session, order.config, report=report)
 
 
 def _follow(server: Server, submitted: QueuedRun, *, detach: bool, report: bool) -> None:
@@ -230,14 +225,3 @@ def _check_writable(directory: Path) -> None:
         Path(tempfile.mkdtemp(prefix=".writable-", dir=existing(directory))).rmdir()
     except OSError as error:
         raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error
-
-
-@contextmanager
-def _run_errors() -> Generator[None]:
-    """As every error; an interrupted run says whether the stand is safe."""
-    with one_line_errors():
-        try:
-            yield
-        except Interrupted as error:
-            typer.echo(one_line(error), err=True)
-            raise typer.Exit(INTERRUPTED) from error

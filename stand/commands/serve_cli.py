@@ -15,7 +15,6 @@ from foundation.clock import WallClock
 from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.output import Output, json_line, output, say
@@ -60,34 +59,33 @@ def serve(
 
     Example: stand serve laboratory.yaml --out /data/sessions
     """
-    with one_line_errors():
-        if port is None and host != _HERE:
-            raise ConfigError(f"--host {host}: give --port, too; without one nothing listens there")
-        path = packaged("", config)
-        stand = load_config(path)
-        texts = _attachments(path, stand)
-        directory = (out or stand.recording.directory).absolute()
-        tokens, hosts = load_tokens(stand.interface.secrets), stand.interface.hosts
-        secop_port = stand.interface.secop_port if secop is None else secop
-        others = () if secop_port is None else (door_at(secop_port),)
-        interface = Interface(directory, host, port, tokens, hosts, others)
-        interface.check()
-        try_doors(interface)
+    if port is None and host != _HERE:
+        raise ConfigError(f"--host {host}: give --port, too; without one nothing listens there")
+    path = packaged("", config)
+    stand = load_config(path)
+    texts = _attachments(path, stand)
+    directory = (out or stand.recording.directory).absolute()
+    tokens, hosts = load_tokens(stand.interface.secrets), stand.interface.hosts
+    secop_port = stand.interface.secop_port if secop is None else secop
+    others = () if secop_port is None else (door_at(secop_port),)
+    interface = Interface(directory, host, port, tokens, hosts, others)
+    interface.check()
+    try_doors(interface)
 
-        @asynccontextmanager
-        async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
-            viewing = Viewing(hub, clock, directory, texts["target.yaml"])
-            served = replace(interface, rooms=(_page(viewing),))
-            async with serve_clients(desk, hub, clock, directory, stand.name, served, desk.patience):
-                where = f"; http://{host}:{port}/" if port is not None else ""
-                where += f"; SECoP at {secop_port}" if secop_port is not None else ""
-                opened = f"{stand.name} is open; sessions go to {directory}{where}"
-                event = Event(clock.now_ns(), "info", "open", opened, {"sessions": str(directory), "port": port})
-                _tell_json(event) if output().as_json else say(opened)
-                with _events_shown(hub):
-                    yield
+    @asynccontextmanager
+    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+        viewing = Viewing(hub, clock, directory, texts["target.yaml"])
+        served = replace(interface, rooms=(_page(viewing),))
+        async with serve_clients(desk, hub, clock, directory, stand.name, served, desk.patience):
+            where = f"; http://{host}:{port}/" if port is not None else ""
+            where += f"; SECoP at {secop_port}" if secop_port is not None else ""
+            opened = f"{stand.name} is open; sessions go to {directory}{where}"
+            event = Event(clock.now_ns(), "info", "open", opened, {"sessions": str(directory), "port": port})
+            _tell_json(event) if output().as_json else say(opened)
+            with _events_shown(hub):
+                yield
 
-        asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))
+    asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))
 
 
 def _attachments(path: Path, stand: StandConfig) -> dict[str, str]:

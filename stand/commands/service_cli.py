@@ -13,7 +13,6 @@ import typer
 
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.files import write_whole
 from foundation.output import say, show
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -44,24 +43,23 @@ def install(
 
     Example: sudo stand service install laboratory.yaml --user operator --yes
     """
-    with one_line_errors():
-        path = packaged("", config).absolute()
-        stand = load_config(path)
-        name = user or os.environ.get("SUDO_USER") or os.environ.get("USER") or "root"
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}", name):
-            raise ConfigError(f"--user {name}: expected the name of a user")
-        files = {root / UNITS / f"{unit_name(stand)}.service": unit(path, stand, name, port), root / RULES: rules(name)}
-        show({"files": {str(file): text for file, text in files.items()}, "written": yes}, _shown(files))
-        if not yes:
-            say("nothing was written; --yes writes these files")
-            return
-        for file, text in files.items():
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, text)
-        say(
-            f"written; now: systemctl daemon-reload && systemctl enable --now {unit_name(stand)}; "
-            "udevadm control --reload && udevadm trigger"
-        )
+    path = packaged("", config).absolute()
+    stand = load_config(path)
+    name = user or os.environ.get("SUDO_USER") or os.environ.get("USER") or "root"
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}", name):
+        raise ConfigError(f"--user {name}: expected the name of a user")
+    files = {root / UNITS / f"{unit_name(stand)}.service": unit(path, stand, name, port), root / RULES: rules(name)}
+    show({"files": {str(file): text for file, text in files.items()}, "written": yes}, _shown(files))
+    if not yes:
+        say("nothing was written; --yes writes these files")
+        return
+    for file, text in files.items():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, text)
+    say(
+        f"written; now: systemctl daemon-reload && systemctl enable --now {unit_name(stand)}; "
+        "udevadm control --reload && udevadm trigger"
+    )
 
 
 def _shown(files: Mapping[Path, str]) -> Iterator[str]:

@@ -12,10 +12,9 @@ from urllib.parse import quote
 from pydantic import ValidationError
 
 from foundation.documents import read_document
-from foundation.errors import ConfigError, SessionError, StandError
+from foundation.errors import ConfigError, Interrupted, SessionError, StandError
 from stand.config.stand_config import StandConfig
 from stand.running.opening.claim import daemon_pid
-from stand.running.opening.stop import Interrupted
 from stand.running.order import Order
 from stand.serving.client import API, Server
 from stand.serving.desk import QueuedRun, StandState

@@ -10,7 +10,6 @@ import typer
 
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.output import output, show
 from stand.commands.reached import DirectoryArgument, reached
 from stand.serving.client import API, Answer
@@ -33,18 +32,17 @@ def add(name: NameArgument, config: ConfigOption = "simulated") -> None:
     """
     from stand.config.interface_section import TokenFile, load_tokens, write_tokens
 
-    with one_line_errors():
-        path = _file(config)
-        tokens = load_tokens(path) if path.expanduser().exists() else {}
-        if name in tokens:
-            raise ConfigError(f"{path}: {name} has a token already; `stand token remove {name}` first")
-        token = secrets.token_urlsafe(_BYTES)
-        try:
-            TokenFile(tokens={name: token})
-        except ValueError:
-            raise ConfigError(f"{name!r}: a name has up to 64 letters, digits and . _ @ -") from None
-        write_tokens(path, {**tokens, name: token})
-        show({"name": name, "token": token}, [token])
+    path = _file(config)
+    tokens = load_tokens(path) if path.expanduser().exists() else {}
+    if name in tokens:
+        raise ConfigError(f"{path}: {name} has a token already; `stand token remove {name}` first")
+    token = secrets.token_urlsafe(_BYTES)
+    try:
+        TokenFile(tokens={name: token})
+    except ValueError:
+        raise ConfigError(f"{name!r}: a name has up to 64 letters, digits and . _ @ -") from None
+    write_tokens(path, {**tokens, name: token})
+    show({"name": name, "token": token}, [token])
 
 
 @app.command("list")
@@ -55,9 +53,8 @@ def list_names(config: ConfigOption = "simulated") -> None:
     """
     from stand.config.interface_section import load_tokens
 
-    with one_line_errors():
-        names = sorted(load_tokens(_file(config)))
-        show(names, names)
+    names = sorted(load_tokens(_file(config)))
+    show(names, names)
 
 
 @app.command()
@@ -68,13 +65,12 @@ def remove(name: NameArgument, config: ConfigOption = "simulated") -> None:
     """
     from stand.config.interface_section import load_tokens, write_tokens
 
-    with one_line_errors():
-        path = _file(config)
-        tokens = load_tokens(path)
-        if name not in tokens:
-            raise ConfigError(f"{path}: {name} has no token; `stand token list` shows who has")
-        write_tokens(path, {other: token for other, token in tokens.items() if other != name})
-        show({"removed": name}, ())
+    path = _file(config)
+    tokens = load_tokens(path)
+    if name not in tokens:
+        raise ConfigError(f"{path}: {name} has no token; `stand token list` shows who has")
+    write_tokens(path, {other: token for other, token in tokens.items() if other != name})
+    show({"removed": name}, ())
 
 
 @app.command()
@@ -83,12 +79,11 @@ def login(directory: DirectoryArgument = None, config: ConfigOption = "simulated
 
     Example: stand token login
     """
-    with one_line_errors():
-        server = reached(directory, config, anywhere=True)
-        answer = cast("Answer", server.request("POST", f"{API}/login"))
-        if not answer["url"] and not output().as_json:
-            raise ConfigError(f"{server.name}: its daemon does not listen to the network; start it with --port")
-        show(answer, [str(answer["url"])])
+    server = reached(directory, config, anywhere=True)
+    answer = cast("Answer", server.request("POST", f"{API}/login"))
+    if not answer["url"] and not output().as_json:
+        raise ConfigError(f"{server.name}: its daemon does not listen to the network; start it with --port")
+    show(answer, [str(answer["url"])])
 
 
 def _file(config: str) -> Path:

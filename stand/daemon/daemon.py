@@ -16,7 +16,7 @@ from pydantic import JsonValue
 
 from drivers.devices.relays import CAMERA_POWER
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import DeviceError, SessionError, StandError, StandTripped
+from foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.tasks import cancelled, failure_text, watched
@@ -32,7 +32,7 @@ from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
 from stand.running.opening.open_stand import OpenStand
-from stand.running.opening.stop import STOPPED, Interrupted, catch_signals
+from stand.running.opening.stop import STOPPED, catch_signals
 from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from experiments.steps import Capture
 from foundation.calls import Lane
-from foundation.errors import ConfigError, SessionError, StandError
+from foundation.errors import ConfigError, Interrupted, SessionError, StandError
 from foundation.hub import Hub
 from foundation.readings import Quality
 from recording.reading.session import Session
@@ -34,7 +34,7 @@ from stand.queueing.queue_work import Halt, Notes, Stopped
 from stand.running.executing.settling_watch import load_for
 from stand.running.guest import Job
 from stand.running.opening.open_stand import OpenStand
-from stand.running.opening.stop import Interrupted, Stop
+from stand.running.opening.stop import Stop
 from stand.running.order import Order, attached_optics, check_plan, parse_order
 from stand.running.resume import Interruption, repaired
 from stand.running.run import run_in

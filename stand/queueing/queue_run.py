@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from foundation.errors import ConfigError, SessionError, StandError, StandTripped
+from foundation.errors import ConfigError, Interrupted, SessionError, StandError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from stand.config.stand_config import StandConfig
@@ -17,7 +17,6 @@ from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Halt, Notes
 from stand.running.memory.entries import Ended
 from stand.running.memory.journal import Journal
-from stand.running.opening.stop import Interrupted
 from stand.running.resume import Interruption, interruption, is_of_virtual_time
 from stand.running.run import resume, run_real, run_virtual
 from stand.running.session_report import NotReported, check_reportable, report_session

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
-from foundation.errors import SessionError, StandError, StandTripped
+from foundation.errors import Interrupted, SessionError, StandError, StandTripped
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.progress import late_progress
@@ -25,7 +25,7 @@ from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
 from stand.running.opening.one_cpu import one_cpu
 from stand.running.opening.open_stand import OpenStand, Time, opened
-from stand.running.opening.stop import Interrupted, Stop
+from stand.running.opening.stop import Stop
 from stand.running.opening.temperature_check import check_temperature
 from stand.running.order import Order
 from stand.running.rehearsal import rehearsed

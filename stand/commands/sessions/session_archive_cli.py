@@ -14,7 +14,7 @@ import typer
 from foundation.clock import WallClock
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import FAILED, one_line_errors
+from foundation.exit_codes import FAILED
 from foundation.output import output, say, show
 from foundation.progress import late_progress
 from foundation.usage import one_line, tell
@@ -56,22 +56,21 @@ def archive_sessions(
 
     Example: stand session archive /data/sessions --to /mnt/nas/sessions --delete-after 30
     """
-    with one_line_errors():
-        recording = load_config(packaged("", config)).recording
-        place, out = directory or recording.directory, to or recording.archive_directory
-        if out is None:
-            raise ConfigError("where to? give --to DIR, or recording.archive_directory in the stand's file")
-        if out.resolve().is_relative_to(check_folder(place).resolve()):
-            raise ConfigError(f"{out}: lies inside of {place}; the copies belong on another disk")
-        with suppress(OSError):
-            os.nice(_NICENESS)
-        done = _Done()
-        _copy(_entries(place), out, done, again=again)
-        if delete_after is not None:
-            _delete(_entries(place), Rule(delete_after), done, yes=yes)
-        show(done.data(), ())
-        if done.failed:
-            raise typer.Exit(FAILED)
+    recording = load_config(packaged("", config)).recording
+    place, out = directory or recording.directory, to or recording.archive_directory
+    if out is None:
+        raise ConfigError("where to? give --to DIR, or recording.archive_directory in the stand's file")
+    if out.resolve().is_relative_to(check_folder(place).resolve()):
+        raise ConfigError(f"{out}: lies inside of {place}; the copies belong on another disk")
+    with suppress(OSError):
+        os.nice(_NICENESS)
+    done = _Done()
+    _copy(_entries(place), out, done, again=again)
+    if delete_after is not None:
+        _delete(_entries(place), Rule(delete_after), done, yes=yes)
+    show(done.data(), ())
+    if done.failed:
+        raise typer.Exit(FAILED)
 
 
 def _entries(place: Path) -> list[Entry]:

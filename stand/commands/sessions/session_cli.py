@@ -15,7 +15,7 @@ import typer
 from foundation.clock import NS_PER_S, VirtualClock
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import FAILED, one_line_errors
+from foundation.exit_codes import FAILED
 from foundation.hub import Hub
 from foundation.instants import parse_instant
 from foundation.items import Event, Item, StepMark
@@ -56,12 +56,11 @@ def info(directory: SessionArgument) -> None:
 
     Example: stand session info sessions/20260101T180000Z-thermal-cycle
     """
-    with one_line_errors():
-        found = overview(check_session(directory))
-        if output().as_json:
-            show(info_json(found), ())
-        else:
-            show(None, info_lines(found))
+    found = overview(check_session(directory))
+    if output().as_json:
+        show(info_json(found), ())
+    else:
+        show(None, info_lines(found))
 
 
 def _sessions_in(directory: Path) -> list[Path]:
@@ -101,14 +100,13 @@ def verify_session(directory: SessionArgument) -> None:
 
     Example: stand session verify sessions/20260101T180000Z-thermal-cycle
     """
-    with one_line_errors():
-        files = inventory(check_session(directory))
-        total_bytes = sum(file.size_bytes for file in files if file.state is State.FINISHED)
-        with late_progress("verify", total_bytes) as report:
-            found = verify(directory, report)
-        show(verify_json(found), verify_lines(found))
-        if not found.is_sound:
-            raise typer.Exit(FAILED)
+    files = inventory(check_session(directory))
+    total_bytes = sum(file.size_bytes for file in files if file.state is State.FINISHED)
+    with late_progress("verify", total_bytes) as report:
+        found = verify(directory, report)
+    show(verify_json(found), verify_lines(found))
+    if not found.is_sound:
+        raise typer.Exit(FAILED)
 
 
 def _part_of(report: Report, done_bytes: int, size_bytes: int) -> Callable[[float, str], None]:
@@ -125,19 +123,18 @@ def salvage(
 
     Example: stand session salvage sessions
     """
-    with one_line_errors():
-        sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
-        done: list[Salvaged] = []
-        done_bytes = 0
-        with late_progress("salvage", sum(sizes.values())) as report:
-            for path, size_bytes in sizes.items():
-                for salvaged in salvage_session(path, _part_of(report, done_bytes, size_bytes)):
-                    done.append(salvaged)
-                done_bytes += size_bytes
-        data = [{**asdict(each), "text": salvage_line(each)} for each in done]
-        show(data, [one_line(salvage_line(each)) for each in done] or ["nothing to salvage"])
-        if any(salvaged.kept for salvaged in done):
-            raise typer.Exit(FAILED)
+    sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
+    done: list[Salvaged] = []
+    done_bytes = 0
+    with late_progress("salvage", sum(sizes.values())) as report:
+        for path, size_bytes in sizes.items():
+            for salvaged in salvage_session(path, _part_of(report, done_bytes, size_bytes)):
+                done.append(salvaged)
+            done_bytes += size_bytes
+    data = [{**asdict(each), "text": salvage_line(each)} for each in done]
+    show(data, [one_line(salvage_line(each)) for each in done] or ["nothing to salvage"])
+    if any(salvaged.kept for salvaged in done):
+        raise typer.Exit(FAILED)
 
 
 @app.command("replay")
@@ -152,17 +149,16 @@ def replay_session(
 
     Example: stand session replay sessions/20260101T180000Z-thermal-cycle --speed 60
     """
-    with one_line_errors():
-        times = _speed(speed)
-        if record is not None:
-            _check_new(record, directory)
-        seen = glance(check_session(directory))
-        with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session, record) as watch:
-            if record is None:
-                asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
-            else:
-                recorded = asyncio.run(replay_and_record(session, record, times, watch))
-                show({"session": recorded}, [recorded])
+    times = _speed(speed)
+    if record is not None:
+        _check_new(record, directory)
+    seen = glance(check_session(directory))
+    with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session, record) as watch:
+        if record is None:
+            asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
+        else:
+            recorded = asyncio.run(replay_and_record(session, record, times, watch))
+            show({"session": recorded}, [recorded])
 
 
 def _speed(text: str) -> float | None:
@@ -235,16 +231,15 @@ def export_session(
 
     Example: stand session export sessions/20260101T180000Z-thermal-cycle --out night --format parquet
     """
-    with one_line_errors():
-        _check_new(out, directory)
-        with _session_to_use(directory, incomplete) as session, late_progress("export", 1.0) as report:
-            if table_format == "mcap":
-                export_mcap(session, out, frames=frames, telemetry=telemetry, report=report)
-                show({"out": out}, [out])
-                return
-            tables = table_format if telemetry else None
-            export(session, out, frames=frames, telemetry=tables, report=report)
-        show({"out": out}, [out])
+    _check_new(out, directory)
+    with _session_to_use(directory, incomplete) as session, late_progress("export", 1.0) as report:
+        if table_format == "mcap":
+            export_mcap(session, out, frames=frames, telemetry=telemetry, report=report)
+            show({"out": out}, [out])
+            return
+        tables = table_format if telemetry else None
+        export(session, out, frames=frames, telemetry=tables, report=report)
+    show({"out": out}, [out])
 
 
 @app.command("trim")
@@ -261,12 +256,11 @@ def trim_session(
 
     Example: stand session trim sessions/20260101T180000Z-thermal-cycle --out part --from step:12 --to +5h
     """
-    with one_line_errors():
-        _check_new(out, directory)
-        seen = glance(check_session(directory))
-        with _session_to_use(directory, incomplete) as session:
-            part = trim(session, out, *_range(begin, end, session, seen))
-            show({"session": part}, [part])
+    _check_new(out, directory)
+    seen = glance(check_session(directory))
+    with _session_to_use(directory, incomplete) as session:
+        part = trim(session, out, *_range(begin, end, session, seen))
+        show({"session": part}, [part])
 
 
 def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple[int, int]:

@@ -15,7 +15,6 @@ from typing import Annotated
 import typer
 
 from foundation.command_app import App
-from foundation.exit_codes import one_line_errors
 from foundation.output import output, say, show
 from foundation.usage import one_line
 from recording.format.inventory import inventory
@@ -41,19 +40,18 @@ def list_sessions(
 
     Example: stand session list /data/sessions --tag paper
     """
-    with one_line_errors():
-        wanted = set(map(check_tag, tag or ()))
-        seen = [entry for entry in _entries(check_folder(directory)) if wanted <= set(entry.tags)]
-        seen = [entry for entry in seen if not (not_archived and entry.archived)]
-        if output().as_json:
-            show([entry_json(entry) for entry in seen], ())
-        elif not seen:
-            with_tag = f" with the tag {', '.join(sorted(wanted))}" if wanted else ""
-            say(f"{directory}: no sessions{with_tag} there")
-        elif sys.stdout.isatty():
-            _show_table(seen)
-        else:
-            typer.echo("\n".join(lines(*rows(seen))))
+    wanted = set(map(check_tag, tag or ()))
+    seen = [entry for entry in _entries(check_folder(directory)) if wanted <= set(entry.tags)]
+    seen = [entry for entry in seen if not (not_archived and entry.archived)]
+    if output().as_json:
+        show([entry_json(entry) for entry in seen], ())
+    elif not seen:
+        with_tag = f" with the tag {', '.join(sorted(wanted))}" if wanted else ""
+        say(f"{directory}: no sessions{with_tag} there")
+    elif sys.stdout.isatty():
+        _show_table(seen)
+    else:
+        typer.echo("\n".join(lines(*rows(seen))))
 
 
 def _entries(directory: Path) -> list[Entry]:
@@ -116,12 +114,11 @@ def tag(
 def _keep(directory: Path, add: Callable[..., None]) -> None:
     from foundation.clock import WallClock
 
-    with one_line_errors():
-        add(check_session(directory), by=user_name(), time_ns=WallClock().now_ns())
-        said = read_notes(directory)
-        count = f"{len(said.notes)} note{'' if len(said.notes) == 1 else 's'}"
-        line = one_line(f"{directory}: {count}, tags: {', '.join(said.tags) or 'none'}")
-        show({"notes": [asdict(each) for each in said.notes], "tags": list(said.tags)}, [line])
+    add(check_session(directory), by=user_name(), time_ns=WallClock().now_ns())
+    said = read_notes(directory)
+    count = f"{len(said.notes)} note{'' if len(said.notes) == 1 else 's'}"
+    line = one_line(f"{directory}: {count}, tags: {', '.join(said.tags) or 'none'}")
+    show({"notes": [asdict(each) for each in said.notes], "tags": list(said.tags)}, [line])
 
 
 def user_name() -> str:

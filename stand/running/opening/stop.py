@@ -6,7 +6,7 @@ import asyncio
 import signal
 from collections.abc import Callable
 
-from foundation.errors import SessionError, StandError, StandTripped
+from foundation.errors import Interrupted, SessionError, StandTripped
 from foundation.patience import Patience
 from stand.fault import Fault
 from stand.gate import Gate, Phase, Turn, next_phase
@@ -14,11 +14,6 @@ from stand.stand import Stand
 
 STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
 STOPPED = Fault(STOPPED_BY_OPERATOR, "stopped by the operator")
-
-
-class Interrupted(StandError):
-    """The operator ended the run (Ctrl-C, SIGTERM or `stand stop`); the text says whether the stand confirmed its safe
-    state."""
 
 
 class Stop:
