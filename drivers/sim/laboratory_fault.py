@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 
 from drivers.sim.laboratory import Laboratory
 
@@ -32,13 +33,29 @@ def number_or_none(value: object) -> float | None:
     return None if value is None else float(str(value))
 
 
-def to(find: Callable[[Laboratory], object], attribute: str, kind: Callable[[object], object] = bool) -> Setter:
-    """Sets one attribute of one fake."""
+def to(path: str, kind: Callable[[object], object] = bool) -> Setter:
+    """Sets one attribute of one fake, by its path from the laboratory."""
+    owner, _, attribute = path.rpartition(".")
 
     def apply(laboratory: Laboratory, value: object) -> None:
-        setattr(find(laboratory), attribute, kind(value))
+        setattr(attrgetter(owner)(laboratory) if owner else laboratory, attribute, kind(value))
 
     return apply
+
+
+def given(path: str) -> Setter:
+    """Gives a number to a method of one fake, unless the value is none."""
+    return lambda laboratory, value: None if value is None else attrgetter(path)(laboratory)(float(str(value)))
+
+
+def flag(path: str, text: str) -> Fault:
+    """One attribute of one fake is true."""
+    return Fault(to(path), True, False, text)
+
+
+def shown(path: str, word: str, text: str) -> Fault:
+    """One attribute of one fake is this word, None once it is mended."""
+    return Fault(to(path, lambda value: word if value else None), True, False, text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,3 +68,8 @@ class Once:
         """It happens, unless the value is none."""
         if value:
             self.act(laboratory)
+
+
+def once(path: str, text: str) -> Fault:
+    """A method of one fake is called."""
+    return Fault(Once(lambda laboratory: attrgetter(path)(laboratory)()), True, False, text)
