@@ -91,7 +91,7 @@ def espec() -> Parser:
         sound = len(fields) == 4 and heard.endswith(b"\n") and not heard.strip(b"-.,0123456789 \r\n")
         return [float(field) for field in fields] if sound else None
 
-    return _language(_ESPEC, lambda number, heard: language._parsed(heard, 4), truth, frozenset({2}))
+    return _language(_ESPEC, lambda number, heard: language._limited(heard), truth, frozenset({2}))
 
 
 def espec_monitor() -> Parser:

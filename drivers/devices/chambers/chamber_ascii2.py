@@ -4,16 +4,15 @@
     $01E 0050.0 0080.0 ... 01100000000000000000000000000000                      sets every field and bit at once
 
 There is no checksum, and a write that has no effect (EXTERN is off at the panel) is answered like one that has: what
-counts is what is read afterwards.
+counts is what is read afterwards. `$01?` describes the fields of a unit, its limits in a form of its own.
 """
 
 from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
 from drivers.devices.chambers.chamber_settings import Ascii2Settings
-from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import Unreachable
 
@@ -38,26 +37,14 @@ def number(value: float) -> str:
     return f"{value:06.1f}"
 
 
-class Language:
+class Language(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
-    resolution_K = 0.1
-    dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
-
     def __init__(self, name: str, settings: Ascii2Settings) -> None:
+        super().__init__(name, settings, SerialSettings(settings.baud, 1))
         self._settings = settings
         self._shape: tuple[int, int] | None = None  # fields and digits of the last reply
         self._way_degC: tuple[float, float] | None = None  # of the last set-point: from where, to where
-        line = SerialSettings(settings.baud, 1)
-        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
-
-    def identity(self) -> str:
-        """It says nothing of itself in this language; `$01?` describes its fields."""
-        return ""
-
-    def limits_degC(self) -> tuple[float, float] | None:
-        """The description has them in a form of its own, which differs."""
-        return None
 
     def state(self) -> ChamberState:
         """Of I."""
@@ -82,9 +69,6 @@ class Language:
     def run(self, on: bool) -> None:
         """E with the start bit; the off_bits are 0."""
         self._write(None, {**dict.fromkeys(self._settings.off_bits, False), self._settings.start_bit: on})
-
-    def renew(self) -> None:
-        """It has no dead-man."""
 
     def _read(self) -> tuple[list[float], str]:
         return self.client.query(self._bytes("I"), self._answer)

@@ -14,9 +14,8 @@ from functools import reduce
 from operator import xor
 from typing import TypeVar
 
-from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
 from drivers.devices.chambers.chamber_settings import CtsSettings
-from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import Refused
 
@@ -47,27 +46,14 @@ def unframed(unit: int, heard: bytes) -> str | None:
     return bytes(byte & 0x7F for byte in body[1:]).decode("latin-1")
 
 
-class Language:
+class Language(ChamberLanguage):
     """One CTS chamber."""
 
-    resolution_K = 0.1
-    dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
-
     def __init__(self, name: str, settings: CtsSettings) -> None:
-        self._name = name
+        super().__init__(name, settings, SerialSettings(settings.baud, 1, settings.parity))
         self._unit = settings.unit
         self._door_reply = settings.door_reply
         self._is_serial = settings.address.startswith("serial:")
-        line = SerialSettings(settings.baud, 1, settings.parity)
-        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
-
-    def identity(self) -> str:
-        """It says nothing of itself."""
-        return ""
-
-    def limits_degC(self) -> tuple[float, float] | None:
-        """It does not tell them."""
-        return None
 
     def state(self) -> ChamberState:
         """Of A0, S, and F when there is an error."""
@@ -92,9 +78,6 @@ class Language:
     def run(self, on: bool) -> None:
         """s1 1 or s1 0."""
         self.client.send(*self._asked(f"s1 {int(on)}", 2, _expecting("s1")))
-
-    def renew(self) -> None:
-        """It has no dead-man."""
 
     def _error_text(self, code: str) -> str:
         text = self.client.query(*self._asked("F", 33, lambda text: text[1:].strip() if text[:1] == "F" else None))

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, whole_line
 from drivers.devices.chambers.chamber_settings import EspecSettings
-from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import GarbledReply, Refused
 
@@ -21,15 +20,6 @@ _HINTS = {"PROTECT ON": "the panel's protection is on: remote control is refused
 _TIMER = "0:10"
 
 
-def _line(heard: bytes) -> str | None:
-    if not heard.endswith(b"\n"):
-        return None
-    line = heard.decode("ascii", "strict").strip("\r\n")
-    if not line or "\n" in line:
-        raise ValueError("more or less than one line")
-    return line
-
-
 def _numbers(text: str, count: int) -> list[float]:
     fields = [field.strip(" ") for field in text.split(",")]
     if len(fields) != count or not all(_NUMBER.fullmatch(field) for field in fields):
@@ -37,22 +27,15 @@ def _numbers(text: str, count: int) -> list[float]:
     return [float(field) for field in fields]
 
 
-class Language:
+class Language(ChamberLanguage):
     """One ESPEC chamber."""
 
-    resolution_K = 0.1
-
     def __init__(self, name: str, settings: EspecSettings) -> None:
-        self._name = name
+        super().__init__(name, settings, SerialSettings(settings.baud, 1))
         self._prefix = "" if settings.unit is None else f"{settings.unit},"
         self._quick_timer = settings.quick_timer
-        self.dead_man = (
-            "its quick timer, which stops it 10 min after the last renewal (unverified on a unit)"
-            if settings.quick_timer
-            else "nothing: it goes on at its set-point, within the limits of its own controller"
-        )
-        line = SerialSettings(settings.baud, 1)
-        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
+        if settings.quick_timer:
+            self.dead_man = "its quick timer, which stops it 10 min after the last renewal (unverified on a unit)"
 
     def identity(self) -> str:
         """The reply to TYPE?, such as T,T,S2,160.0."""
@@ -66,7 +49,7 @@ class Language:
     def state(self) -> ChamberState:
         """Of TEMP?, MON?, HUMI? and ALARM?."""
         actual_degC, set_degC, _, _ = self._temperatures()
-        _, humidity, mode, alarms = self._monitored()
+        _, humidity, mode, alarms = self.client.query(self._bytes("MON?"), self._monitor)
         word = (mode.split() or [""])[0]
         if word not in _MODES:
             raise GarbledReply(self._name, f"unknown mode {mode!r}")
@@ -101,21 +84,19 @@ class Language:
             self._tell("TIMER,ON,0")
 
     def _temperatures(self) -> list[float]:
-        return self.client.query(self._bytes("TEMP?"), lambda heard: self._parsed(heard, 4))
+        return self.client.query(self._bytes("TEMP?"), self._limited)
 
-    def _parsed(self, heard: bytes, count: int) -> list[float] | None:
-        line = _line(heard)
+    def _limited(self, heard: bytes) -> list[float] | None:
+        """Actual, set, high and low limit; None until they have come whole."""
+        line = whole_line(heard)
         if line is None:
             return None
         self._refuse(line, "TEMP?")
-        return _numbers(line, count)
-
-    def _monitored(self) -> tuple[float, str, str, int]:
-        return self.client.query(self._bytes("MON?"), self._monitor)
+        return _numbers(line, 4)
 
     def _monitor(self, heard: bytes) -> tuple[float, str, str, int] | None:
         """Temperature, humidity, mode, number of alarms; None until they have come whole."""
-        line = _line(heard)
+        line = whole_line(heard)
         if line is None:
             return None
         self._refuse(line, "MON?")
@@ -130,12 +111,12 @@ class Language:
         return len(fields) > 1 and bool(_NUMBER.fullmatch(fields[1].strip()))
 
     def _ask(self, command: str) -> str:
-        line = self.client.query(self._bytes(command), _line)
+        line = self.client.query(self._bytes(command), whole_line)
         self._refuse(line, command)
         return line
 
     def _tell(self, command: str) -> None:
-        line = self.client.send(self._bytes(command), _line)
+        line = self.client.send(self._bytes(command), whole_line)
         self._refuse(line, command)
         if not line.startswith("OK:"):
             raise GarbledReply(self._name, f"{command!r} was answered by {line!r}")

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, whole_line
 from drivers.devices.chambers.chamber_settings import JulaboSettings
-from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import GarbledReply, Refused
 
@@ -23,18 +22,9 @@ _ABOUT_A_COMMAND = {"-08", "-09", "-10", "-11", "-13"}  # of the last one; the o
 _BY_HAND = "it is operated by hand: choose remote control (RS232, USB) at its panel"
 
 
-def _line(heard: bytes) -> str | None:
-    if not heard.endswith(b"\n"):
-        return None
-    line = heard.decode("ascii").strip("\r\n")
-    if not line or "\n" in line:
-        raise ValueError("more or less than one line")
-    return line
-
-
 def number_of(heard: bytes) -> float | None:
     """The temperature in a reply, degC; None until it has come whole; ValueError when it is none."""
-    line = _line(heard)
+    line = whole_line(heard)
     if line is None:
         return None
     if not _NUMBER.fullmatch(line.strip()):
@@ -44,7 +34,7 @@ def number_of(heard: bytes) -> float | None:
 
 def status_of(heard: bytes) -> tuple[str, str] | None:
     """Code and words of a reply to `status`; None until it has come whole; ValueError when it is none."""
-    line = _line(heard)
+    line = whole_line(heard)
     if line is None:
         return None
     if (found := _STATUS.fullmatch(line)) is None:
@@ -52,29 +42,20 @@ def status_of(heard: bytes) -> tuple[str, str] | None:
     return found[1], found[2]
 
 
-class Language:
+class Language(ChamberLanguage):
     """One circulator."""
 
-    resolution_K = 0.1
-    dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
-
     def __init__(self, name: str, settings: JulaboSettings) -> None:
-        self._name = name
-        line = SerialSettings(settings.baud, 1, settings.parity, settings.databits)
-        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
+        super().__init__(name, settings, SerialSettings(settings.baud, 1, settings.parity, settings.databits))
 
     def identity(self) -> str:
         """The reply to `version`."""
-        return self.client.query(b"version\r", _line)
-
-    def limits_degC(self) -> tuple[float, float] | None:
-        """It does not tell them."""
-        return None
+        return self.client.query(b"version\r", whole_line)
 
     def state(self) -> ChamberState:
         """Of the bath, and of its status: what that says of a command that it did not take is no alarm."""
         code, words = self._status()
-        mode = self.client.query(b"in_mode_05\r", _line)
+        mode = self.client.query(b"in_mode_05\r", whole_line)
         if mode not in ("0", "1"):
             raise GarbledReply(self._name, f"in_mode_05 was answered by {mode!r}")
         is_alarm = code.startswith("-") and code not in _ABOUT_A_COMMAND
@@ -96,9 +77,6 @@ class Language:
     def run(self, on: bool) -> None:
         """out_mode_05 1 or 0."""
         self._tell(f"out_mode_05 {int(on)}")
-
-    def renew(self) -> None:
-        """It has no dead-man."""
 
     def _status(self) -> tuple[str, str]:
         code, words = self.client.query(b"status\r", status_of)

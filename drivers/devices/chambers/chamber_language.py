@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
+from drivers.devices.chambers.chamber_settings import ChamberUnitSettings
 from drivers.wires.line_client import LineClient
+from drivers.wires.link import SerialSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,42 +27,55 @@ class ChamberState:
     by_hand: str = ""
 
 
-class ChamberLanguage(Protocol):
-    """One conversation, blocking. All calls raise Unreachable, GarbledReply, Refused or DeviceFault.
+class ChamberLanguage(ABC):
+    """One conversation, blocking. All calls raise Unreachable, GarbledReply, Refused or DeviceFault. A make whose unit
+    does not have something leaves that as it is here.
 
     client: of its requests. resolution_K: of a set-point. dead_man: what ends the heat when this computer dies, in
     words.
     """
 
-    client: LineClient
-    resolution_K: float
-    dead_man: str
+    resolution_K = 0.1
+    dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
+
+    def __init__(self, name: str, settings: ChamberUnitSettings, line: SerialSettings) -> None:
+        self._name = name
+        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
 
     def identity(self) -> str:
         """What it says of itself; "" when it says nothing."""
-        ...
+        return ""
 
     def limits_degC(self) -> tuple[float, float] | None:
         """The lowest and highest set-point of its own controller; None when it does not tell them."""
-        ...
+        return None
 
+    @abstractmethod
     def state(self) -> ChamberState:
         """How it is now."""
-        ...
 
+    @abstractmethod
     def set_temperature(self, degC: float) -> None:
         """Send a set-point, once."""
-        ...
 
+    @abstractmethod
     def humidity_off(self) -> None:
         """Switch humidity and condensation off; Refused, with what to do at the panel, when it has no command for
         that."""
-        ...
 
+    @abstractmethod
     def run(self, on: bool) -> None:
         """Start or stop, once."""
-        ...
 
-    def renew(self) -> None:
+    def renew(self) -> None:  # noqa: B027 - most have no dead-man
         """What keeps its own dead-man, if it has one, from stopping it."""
-        ...
+
+
+def whole_line(heard: bytes) -> str | None:
+    """The line that has come, ASCII; None until it has ended; ValueError when it is not one."""
+    if not heard.endswith(b"\n"):
+        return None
+    line = heard.decode("ascii").strip("\r\n")
+    if not line or "\n" in line:
+        raise ValueError("more or less than one line")
+    return line

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import ChamberState
+from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
 from drivers.devices.chambers.chamber_settings import SimservSettings
-from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.errors import GarbledReply, Refused
 
@@ -43,17 +42,12 @@ def reply_of(heard: bytes) -> tuple[str, list[str]] | None:
     return code, values
 
 
-class Language:
+class Language(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
-    resolution_K = 0.1
-    dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
-
     def __init__(self, name: str, settings: SimservSettings) -> None:
-        self._name = name
+        super().__init__(name, settings, SerialSettings(9600, 1))  # the line is of no meaning over TCP
         self._settings = settings
-        line = SerialSettings(9600, 1)  # of no meaning over TCP
-        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
 
     def identity(self) -> str:
         """Its type and serial number."""
@@ -88,9 +82,6 @@ class Language:
     def run(self, on: bool) -> None:
         """The start channel."""
         self._tell(14001, self._settings.start_channel, int(on))
-
-    def renew(self) -> None:
-        """It has no dead-man."""
 
     def _alarms(self) -> tuple[str, ...]:
         """The texts of the alarms that stand, of all its messages."""

@@ -41,7 +41,6 @@ class ClimateChamber:
     ) -> None:
         self.name = name
         self.identity: Identity | None = None
-        self.dead_man = ""
         self._settings = settings
         self._allowed_degC = allowed_degC
         self._clock = clock
@@ -73,7 +72,7 @@ class ClimateChamber:
     async def read(self) -> tuple[Reading, ...]:
         """pv, sp, running, fault; the reason of `fault` has its alarms and what was done at the panel."""
         async with self._exclusive:
-            state = await self._call(self._state)
+            state = await self._call(self._ready)
             if self._is_run and state.running and self._clock.now_ns() >= self._renew_ns:
                 await self._call(self._language.renew)
                 self._renew_ns = self._clock.now_ns() + seconds_ns(_RENEW_S)
@@ -144,9 +143,6 @@ class ClimateChamber:
         if not (self._exclusive.is_known and self._language.client.connected):
             self._check()
         return self._language.state()
-
-    def _state(self) -> ChamberState:
-        return self._ready()
 
     def _set(self, degC: float) -> None:
         state = self._ready()
