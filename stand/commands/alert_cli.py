@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import typer
 
 from foundation.command_app import App
 from foundation.errors import ConfigError, StandError
 from foundation.output import show
 from foundation.usage import one_line
+from stand.commands.reached import ConfigOption
 
 app = App(no_args_is_help=True)
 _LIMIT_S = 20.0
@@ -24,9 +23,7 @@ def alert() -> None:
 
 
 @app.command("test")
-def try_them(
-    config: Annotated[str, typer.Option(help="The stand's file, or an installed configuration.")] = "simulated",
-) -> None:
+def try_them(config: ConfigOption = "simulated") -> None:
     """Send a test message to each receiver, and give the sign of life once.
 
     Example: stand alert test --config my-stand.yaml

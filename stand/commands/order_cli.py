@@ -16,7 +16,15 @@ from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.output import say, show
 from foundation.usage import one_line
-from stand.commands.reached import ConfigOption, DirectoryOption, TokenOption, UrlOption, on_stand, reached
+from stand.commands.reached import (
+    ConfigOption,
+    DirectoryOption,
+    RecipeArgument,
+    TokenOption,
+    UrlOption,
+    on_stand,
+    reached,
+)
 from stand.commands.submitted import submit_recipe
 from stand.serving.client import API, Answer, Server, running_sessions
 from stand.serving.desk import DeviceState, StandState
@@ -30,7 +38,7 @@ _LIMIT_S = 60.0  # a device may move for so long
 @on_stand(by_option=True)
 def submit(
     server: Server,
-    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
+    recipe: RecipeArgument,
     attended: Annotated[
         bool, typer.Option("--attended", help="A person will do what the plan's prompts ask for.")
     ] = False,

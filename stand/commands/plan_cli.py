@@ -16,6 +16,7 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.command_app import App
 from foundation.ending import Ending
 from foundation.output import say, show
+from stand.commands.reached import ConfigOption, RecipeArgument
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.absent import absences
 from stand.estimating.camera_lines import camera_lines
@@ -32,10 +33,8 @@ _ENDING = {signal.SIGINT, signal.SIGTERM}
 
 @app.command()
 def plan(
-    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
-    config: Annotated[
-        str, typer.Option("--config", help="A configuration file, or the name of an installed one.")
-    ] = "simulated",
+    recipe: RecipeArgument,
+    config: ConfigOption = "simulated",
 ) -> None:
     """The steps of a recipe with durations, frames, bytes and end time, without running anything.
 

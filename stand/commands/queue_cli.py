@@ -17,7 +17,7 @@ from foundation.instants import date_time, duration
 from foundation.output import say, show
 from foundation.usage import one_line
 from stand.commands.queue_door import DaemonDoor, Door, OutOption, at_door, directory_of
-from stand.commands.reached import ConfigOption
+from stand.commands.reached import ConfigOption, RecipeArgument
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_run import conclude, run_entry
@@ -39,7 +39,7 @@ _COLUMNS = ("id", "next", "recipe", "state", "added (local)", "took", "session",
 @at_door
 def add(
     door: Door,
-    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
+    recipe: RecipeArgument,
 ) -> None:
     """Check a recipe and queue it as it is now: later edits of the files do not change it. Prints its number.
 

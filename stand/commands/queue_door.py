@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import typer
 
@@ -14,11 +13,11 @@ from foundation.clock import WallClock
 from foundation.command_app import with_parameters
 from foundation.errors import ConfigError, InUse, SessionError
 from foundation.output import say
-from stand.commands.reached import ConfigOption, TokenOption, UrlOption
+from stand.commands.reached import OPTIONS
 from stand.commands.submitted import submit_recipe
 from stand.commissioning.answering import not_answering
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.estimating.run_estimate import existing, price_night, small_disk
+from stand.estimating.run_estimate import price_night, small_disk
 from stand.queueing import queue
 from stand.queueing.queue_file import Entry
 from stand.running.order import load_order
@@ -31,50 +30,29 @@ OutOption = Annotated[
 ]
 
 
-class Door(Protocol):
-    """What can be done with a queue; ConfigError and SessionError say what is wrong."""
-
-    name: str
-
-    def add(self, recipe: str) -> int:
-        """Its number; checked before as far as can be."""
-        ...
-
-    def runs(self) -> tuple[str, list[Entry | QueuedRun]]:
-        """Why it is halted, "" when it is not, and the runs."""
-        ...
-
-    def move(self, number: int, position: int) -> None:
-        """1 is the next to be run."""
-        ...
-
-    def remove(self, number: int) -> None:
-        """What it has recorded stays."""
-        ...
-
-
 class DaemonDoor:
-    """The daemon checks wires, identities, the disk and its limits when it is given a run."""
+    """Through the daemon, which checks wires, identities, the disk and its limits when it is given a run. ConfigError
+    and SessionError say what is wrong."""
 
     def __init__(self, server: Server) -> None:
         self.name = server.name
         self._server = server
 
     def add(self, recipe: str) -> int:
-        """As Door."""
+        """Its number; checked before as far as can be."""
         return submit_recipe(self._server, recipe).id
 
     def runs(self) -> tuple[str, list[Entry | QueuedRun]]:
-        """As Door."""
+        """Why it is halted, "" when it is not, and the runs."""
         state = self._server.state()
         return state.queue_halted, list(state.queue)
 
     def move(self, number: int, position: int) -> None:
-        """As Door."""
+        """1 is the next to be run."""
         self._server.request("POST", f"{API}/queue/{number}/move", {"to": position})
 
     def remove(self, number: int) -> None:
-        """As Door."""
+        """What it has recorded stays."""
         self._server.request("DELETE", f"{API}/queue/{number}")
 
 
@@ -87,10 +65,10 @@ class FileDoor:
         self._directory, self._config = directory, config
 
     def add(self, recipe: str) -> int:
-        """As Door."""
+        """As DaemonDoor."""
         order = load_order(recipe, self._config)
         night = price_night(tuple(order.recipe.plan()), order.config, self._directory)
-        if lack := small_disk(shutil.disk_usage(existing(self._directory)).free, night.steps, order.config):
+        if lack := small_disk(self._directory, night.steps, order.config):
             raise SessionError(f"{self._directory}: {lack}")
         if order.config.simulation is None:
             self._check_wires(order.config)
@@ -108,17 +86,20 @@ class FileDoor:
             raise SessionError(f"this stand cannot run it now, and nothing was queued: {'; '.join(lacks)}")
 
     def runs(self) -> tuple[str, list[Entry | QueuedRun]]:
-        """As Door."""
+        """As DaemonDoor."""
         found = queue.queued(self._directory)
         return found.halted, list(found.entries)
 
     def move(self, number: int, position: int) -> None:
-        """As Door."""
+        """As DaemonDoor."""
         queue.move(self._directory, number, position)
 
     def remove(self, number: int) -> None:
-        """As Door."""
+        """As DaemonDoor."""
         queue.remove(self._directory, number)
+
+
+Door = DaemonDoor | FileDoor
 
 
 def door(config: str, out: Path | None, url: str, token_file: Path | None) -> Door:
@@ -145,10 +126,4 @@ def at_door(function: Callable[..., None]) -> Callable[..., None]:
         function(door(config, out, url, token_file), *arguments, **more)
 
     command.__name__, command.__doc__ = function.__name__, function.__doc__
-    found_by: dict[str, tuple[Any, object]] = {
-        "config": (ConfigOption, "simulated"),
-        "out": (OutOption, None),
-        "url": (UrlOption, ""),
-        "token_file": (TokenOption, None),
-    }
-    return with_parameters(command, function, found_by, without="door")
+    return with_parameters(command, function, {"out": (OutOption, None), **OPTIONS}, without="door")

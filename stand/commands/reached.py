@@ -20,16 +20,16 @@ DirectoryArgument = Annotated[
 DirectoryOption = Annotated[
     Path | None, typer.Option("--dir", help="The daemon's folder of sessions; else recording.directory of --config.")
 ]
+RecipeArgument = Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")]
 ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
 UrlOption = Annotated[
     str, typer.Option("--url", help="A stand's address, http://HOST:PORT, instead of its socket here.")
 ]
 TokenOption = Annotated[Path | None, typer.Option("--token-file", help="The file with the token for --url.")]
 
-
 Command = Callable[..., None]
 
-_OPTIONS: dict[str, tuple[Any, object]] = {
+OPTIONS: dict[str, tuple[Any, object]] = {
     "config": (ConfigOption, "simulated"),
     "url": (UrlOption, ""),
     "token_file": (TokenOption, None),
@@ -49,7 +49,7 @@ def on_stand(
         ) -> None:
             function(reached(directory, config, url, token_file, anywhere=anywhere), *arguments, **options)
 
-        added = {"directory": (DirectoryOption if by_option else DirectoryArgument, None), **_OPTIONS}
+        added = {"directory": (DirectoryOption if by_option else DirectoryArgument, None), **OPTIONS}
         return with_parameters(command, function, added, without="server")
 
     return take

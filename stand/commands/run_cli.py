@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,7 +19,7 @@ from foundation.output import output, say, show
 from foundation.usage import tell
 from recording.repair.salvage import salvage_line
 from stand.commands.checked_cli import warn_unchecked
-from stand.commands.reached import TokenOption, UrlOption
+from stand.commands.reached import ConfigOption, RecipeArgument, TokenOption, UrlOption
 from stand.commands.submitted import daemon_of, follow, submit, submit_recipe, submit_resumed
 from stand.config.checked import load_checked
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -66,10 +65,8 @@ def demo(
 
 @app.command()
 def run(
-    recipe: Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")],
-    config: Annotated[
-        str, typer.Option("--config", help="A configuration file, or the name of an installed one.")
-    ] = "simulated",
+    recipe: RecipeArgument,
+    config: ConfigOption = "simulated",
     out: Annotated[Path | None, typer.Option(help="Where the session goes; else recording.directory.")] = None,
     virtual_time: Annotated[
         bool,
@@ -108,7 +105,7 @@ def run(
     directory = out or order.config.recording.directory
     _check_writable(directory)
     night = price_night(tuple(order.recipe.plan()), order.config, directory)
-    if lack := small_disk(shutil.disk_usage(existing(directory)).free, night.steps, order.config):
+    if lack := small_disk(directory, night.steps, order.config):
         say(f"warning: {directory}: {lack}")
     with followed(order, night, directory, is_virtual=virtual_time) as watch:
         work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
@@ -132,9 +129,7 @@ def _check_seed(seed: int | None, *, virtual_time: bool) -> None:
 @app.command("resume")
 def resume_run(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="The session of a run that did not end.")],
-    config: Annotated[
-        str, typer.Option("--config", help="This stand's configuration: a file, or the name of an installed one.")
-    ] = "simulated",
+    config: ConfigOption = "simulated",
     clear: Annotated[
         bool, typer.Option("--clear", help="Clear a trip first; only when its cause has been removed.")
     ] = False,

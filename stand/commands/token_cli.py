@@ -11,7 +11,7 @@ import typer
 from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.output import output, show
-from stand.commands.reached import DirectoryArgument, reached
+from stand.commands.reached import ConfigOption, DirectoryArgument, reached
 from stand.serving.client import API, Answer
 
 app = App(
@@ -19,7 +19,6 @@ app = App(
     help="Tokens for the network: add, list, remove, login.\n\nExample: stand token add rose --config my-stand.yaml",
 )
 
-ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
 NameArgument = Annotated[str, typer.Argument(help="Who has the token; it is recorded with what they do.")]
 _BYTES = 32
 

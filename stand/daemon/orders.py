@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import importlib.resources
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,7 +24,7 @@ from recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, Disk, Di
 from stand.config.checked import ATTACHMENT
 from stand.config.stand_config import StandConfig
 from stand.estimating.learned import learn
-from stand.estimating.run_estimate import Night, existing, price_night, small_disk
+from stand.estimating.run_estimate import Night, price_night, small_disk
 from stand.queueing import queue
 from stand.queueing.queue import Asked, order_of
 from stand.queueing.queue_file import Entry, Queue, State, worked_on
@@ -208,19 +207,8 @@ class Orders:
 
     def shown_run(self, entry: Entry) -> QueuedRun:
         """One of it."""
-        return QueuedRun(
-            id=entry.id,
-            recipe=entry.recipe,
-            state=entry.state.value,
-            added_ns=entry.added_ns,
-            began_ns=entry.began_ns,
-            ended_ns=entry.ended_ns,
-            session=entry.session,
-            reason=entry.reason,
-            expected_s=self._expected_s.get(entry.id),
-            key=entry.key,
-            added_by=entry.added_by,
-        )
+        same = entry.model_dump(mode="json", include=set(QueuedRun.model_fields))
+        return QueuedRun(**same, expected_s=self._expected_s.get(entry.id))
 
     async def _changed(self, change: Callable[..., object], *arguments: object) -> None:
         try:
@@ -282,7 +270,7 @@ class Orders:
     def _night(self, order: Order) -> Night:
         """What the run will take; Conflict when the disk has no room for it."""
         night = price_night(tuple(order.recipe.plan()), order.config, self.directory)
-        if lack := small_disk(shutil.disk_usage(existing(self.directory)).free, night.steps, order.config):
+        if lack := small_disk(self.directory, night.steps, order.config):
             raise Conflict(f"{self.directory}: {lack}")
         return night
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,8 +38,9 @@ def existing(directory: Path) -> Path:
     return next(path for path in (directory, *directory.absolute().parents) if path.exists() or path.is_symlink())
 
 
-def small_disk(free_bytes: int, steps: Iterable[PricedStep], config: StandConfig) -> str:
-    """What is wrong with so much room for a run that would stop in the middle of the night; "" when it will do."""
+def small_disk(directory: Path, steps: Iterable[PricedStep], config: StandConfig) -> str:
+    """What is wrong with the disk's room for a run that would stop in the middle of the night; "" when it will do."""
+    free_bytes = shutil.disk_usage(existing(directory)).free
     plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
     if free_bytes / 1e9 >= plan_GB + least_GB:
         return ""

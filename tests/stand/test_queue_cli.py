@@ -135,7 +135,7 @@ async def test_a_queue_that_a_daemon_has_is_reached_through_it(tmp_path: Path):
 
 
 def test_a_night_that_the_disk_has_no_room_for_is_not_queued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("stand.commands.queue_door.shutil.disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    monkeypatch.setattr("stand.estimating.run_estimate.shutil.disk_usage", lambda _: SimpleNamespace(free=1_000_000))
     refused = invoke(tmp_path, "add", "demo")
     assert (refused.exit_code, "GB are free" in refused.stderr) == (1, True)
     assert not (tmp_path / QUEUE_NAME).exists()

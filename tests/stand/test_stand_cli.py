@@ -1,9 +1,11 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -142,13 +144,18 @@ def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_
     assert not (tmp_path / "out").exists()
 
 
-def test_a_disk_that_is_too_small_for_the_plan_is_reported():
+def test_a_disk_that_is_too_small_for_the_plan_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def free(size_bytes: int) -> None:
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=size_bytes))
+
     order = load_order("overnight", "simulated")
     steps = price(order.recipe.plan(), order.config)
-    assert small_disk(11_000_000_000, steps, order.config) == (
+    free(11_000_000_000)
+    assert small_disk(tmp_path, steps, order.config) == (
         "11.0 GB are free; the plan records 9.1 GB and waits below 2.0 GB"
     )
-    assert small_disk(11_200_000_000, steps, order.config) == ""
+    free(11_200_000_000)
+    assert small_disk(tmp_path, steps, order.config) == ""
 
 
 def test_ctrl_c_while_the_commands_are_imported_ends_with_a_line(tmp_path: Path):

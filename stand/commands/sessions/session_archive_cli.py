@@ -19,10 +19,10 @@ from foundation.output import output, say, show
 from foundation.progress import late_progress
 from foundation.usage import one_line, tell
 from recording.exporting.archive import Rule, archive, delete, unfit
-from recording.format.inventory import inventory
-from recording.reading.catalogue import Entry, catalogue, look_at
+from recording.reading.catalogue import Entry
+from stand.commands.reached import ConfigOption
 from stand.commands.sessions.session_args import check_folder
-from stand.commands.sessions.session_list_cli import user_name
+from stand.commands.sessions.session_list_cli import sessions_at, user_name
 from stand.commands.sessions.session_table import size
 from stand.config.stand_config import load_config, packaged
 
@@ -43,7 +43,7 @@ def archive_sessions(
     to: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where the copies go; else recording.archive_directory.")
     ] = None,
-    config: Annotated[str, typer.Option(help="The stand's file, or an installed configuration.")] = "simulated",
+    config: ConfigOption = "simulated",
     again: Annotated[bool, typer.Option("--again", help="Copy those once more whose copy is gone.")] = False,
     delete_after: Annotated[
         float | None,
@@ -65,16 +65,12 @@ def archive_sessions(
     with suppress(OSError):
         os.nice(_NICENESS)
     done = _Done()
-    _copy(_entries(place), out, done, again=again)
+    _copy(sessions_at(place), out, done, again=again)
     if delete_after is not None:
-        _delete(_entries(place), Rule(delete_after), done, yes=yes)
+        _delete(sessions_at(place), Rule(delete_after), done, yes=yes)
     show(done.data(), ())
     if done.failed:
         raise typer.Exit(FAILED)
-
-
-def _entries(place: Path) -> list[Entry]:
-    return [look_at(place)] if inventory(place) else catalogue(place)
 
 
 @dataclass

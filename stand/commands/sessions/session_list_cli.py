@@ -41,7 +41,7 @@ def list_sessions(
     Example: stand session list /data/sessions --tag paper
     """
     wanted = set(map(check_tag, tag or ()))
-    seen = [entry for entry in _entries(check_folder(directory)) if wanted <= set(entry.tags)]
+    seen = [entry for entry in sessions_at(check_folder(directory)) if wanted <= set(entry.tags)]
     seen = [entry for entry in seen if not (not_archived and entry.archived)]
     if output().as_json:
         show([entry_json(entry) for entry in seen], ())
@@ -54,7 +54,7 @@ def list_sessions(
         typer.echo("\n".join(lines(*rows(seen))))
 
 
-def _entries(directory: Path) -> list[Entry]:
+def sessions_at(directory: Path) -> list[Entry]:
     """`directory` itself when it is a session, else those in it."""
     if inventory(directory):
         return [look_at(directory)]
