@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self, cast
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from experiments.steps import WANTED_STATES, WantedState
+from foundation.documents import Document
 
 COLDEST_degC, WARMEST_degC = -10.0, 70.0  # the paper's chamber, section 2
 _SHORTEST_DWELL_s = 60.0
@@ -18,10 +19,8 @@ Linear_mm = Annotated[float, Field(ge=-300, le=300)]  # the linear table's trave
 Rotary_deg = Annotated[float, Field(ge=-360, le=360)]
 
 
-class CaptureParameters(BaseModel):
+class CaptureParameters(Document):
     """How every experiment takes its frames."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     interval_s: float = Field(default=0.5, gt=0, le=86400)
     exposure_s: float = Field(default=0.1, gt=0, le=10)
@@ -39,13 +38,11 @@ class StillTable(CaptureParameters):
     table_position: dict[str, float] = Field(default_factory=dict)
 
 
-class Settled(BaseModel):
+class Settled(Document):
     """When a camera counts as settled; see steps.SoakUntilSettled.
 
     The drift decides: it is seen to some 0.1 mpx/min, while cameras give their temperature in digits of 0.1 to 0.5 K.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     min_s: Wait_s = 600.0
     window_s: float = Field(default=600.0, ge=60, le=3600)
@@ -60,14 +57,12 @@ class Settled(BaseModel):
         return self
 
 
-class Known(BaseModel):
+class Known(Document):
     """Experimental: when enough is known of a camera, and within what the night decides; see steps.Decide.
 
     states: those in which the model is wanted, throughout the range of the set-points: of a camera at rest, 4 h after a
     change, or on the way, 45 min after it. wait_s: for a decision, in real time.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     residual_px: float = Field(default=0.005, gt=0, le=10)
     dwells_s: tuple[Wait_s, ...] = Field(default=(900.0, 1500.0, 2700.0), min_length=1, max_length=5)
@@ -104,10 +99,8 @@ def _either(value: object, kinds: Mapping[str, type[Settled | Known]]) -> object
     raise ValueError(f"until takes {names}, alone or with thresholds behind a colon, not {value!r}")
 
 
-class _UntilSettled(BaseModel):
+class _UntilSettled(Document):
     """As a recipe writes thresholds."""
-
-    model_config = ConfigDict(extra="forbid")
 
     settled: Settled
 
@@ -115,10 +108,8 @@ class _UntilSettled(BaseModel):
 Until = Annotated[Settled | None, BeforeValidator(_settled, json_schema_input_type=_UntilSettled | Literal["settled"])]
 
 
-class _UntilKnown(BaseModel):
+class _UntilKnown(Document):
     """As a recipe writes it."""
-
-    model_config = ConfigDict(extra="forbid")
 
     known: Known
 
@@ -140,10 +131,8 @@ def check_until(until: Settled | None, dwell_s: float, name: str = "dwell_s") ->
         )
 
 
-class TablePosition(BaseModel):
+class TablePosition(Document):
     """Where the table holds the target."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     linear_mm: Linear_mm
     rotary_deg: Rotary_deg

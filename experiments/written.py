@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Self, cast
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from experiments.parameters import CaptureParameters, Chamber_degC, FrameCount, Settled, Wait_s, check_until
 from experiments.pieces import dwell, placed
@@ -30,6 +30,7 @@ from experiments.steps import (
     Step,
     StopChamber,
 )
+from foundation.documents import Document
 
 Place = tuple[str | int, ...]  # of an entry within the recipe, as in ("experiments", 0, "steps", 3)
 
@@ -50,11 +51,7 @@ class Written:
     step: Step
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Nothing(_Part):
+class Nothing(Document):
     """A step without parameters."""
 
 
@@ -87,7 +84,7 @@ class SoakUntilSettledEntry(Settled):
         return self
 
 
-class CoolDownEntry(_Part):
+class CoolDownEntry(Document):
     """As the step CoolDown."""
 
     band_K: float = Field(default=0.5, gt=0, le=20)
@@ -95,14 +92,14 @@ class CoolDownEntry(_Part):
     max_s: Wait_s = 7200.0
 
 
-class Repeat(_Part):
+class Repeat(Document):
     """The same steps `times` times."""
 
     times: int = Field(ge=1, le=10_000)
     steps: StepEntries = Field(min_length=1)
 
 
-class Ramp(_Part):
+class Ramp(Document):
     """The set-point goes from where it is to `to_degC`, by `rate_K_per_min`: a new set-point every `every_K`, a soak
     that keeps the rate, then `steps`."""
 
@@ -153,7 +150,7 @@ _AxisNames = Annotated[
 ]
 
 
-class StepEntry(_Part):
+class StepEntry(Document):
     """One step, repeat or ramp."""
 
     start_chamber: Chamber_degC | None = None

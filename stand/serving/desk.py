@@ -13,6 +13,7 @@ from typing import Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
+from foundation.documents import Document
 from foundation.errors import StandError
 from foundation.readings import Cause, Quality
 from recording.reading.notes import LONGEST_NOTE
@@ -230,14 +231,12 @@ class WrittenStep(Value):
     parameters: dict[str, JsonValue] = Field(default_factory=dict)
 
 
-class RunRequest(Value):
+class RunRequest(Document):
     """A run that is asked for: the name of an installed recipe, or the text of one. Names of files are not taken: the
     interface must not be a way to read any.
 
     attended: somebody is there to do what the plan prompts for. tags, note: for the catalogue of sessions.
     """
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="forbid")
 
     recipe: str = Field(default="", max_length=200)
     recipe_text: str = Field(default="", max_length=1 << 18)
@@ -290,11 +289,9 @@ class SimulatedFaults(Value):
     standing: dict[str, JsonValue]
 
 
-class FaultRequest(Value):
+class FaultRequest(Document):
     """What is to be broken in the simulated laboratory: value, null for the worst; for_s: for so long, null until it is
     mended. mend: it is mended instead."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="forbid")
 
     name: str = Field(max_length=100)
     value: JsonValue = None

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Path, Request, Response
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import Field, JsonValue
 
+from foundation.documents import Document
 from recording.reading.notes import LONGEST_NOTE
 from stand.serving.api.access import STOP_PATH
 from stand.serving.api.bridge import Bridge
@@ -27,50 +28,46 @@ _Id = Annotated[int, Path(ge=1, le=1 << 53)]
 _Name = Annotated[str, Path(max_length=255)]
 
 
-class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PauseRequest(_Body):
+class PauseRequest(Document):
     """now: before the next action; step: when the step under way is done."""
 
     when: When = "now"
 
 
-class SkipRequest(_Body):
+class SkipRequest(Document):
     """The step that is left out or broken off."""
 
     step_id: str = Field(max_length=200)
 
 
-class ExtendRequest(_Body):
+class ExtendRequest(Document):
     """The soak that takes longer, and by how much."""
 
     step_id: str = Field(max_length=200)
     by_s: float = Field(gt=0, le=31_622_400)
 
 
-class PlanRequest(_Body):
+class PlanRequest(Document):
     """The steps from a place on are replaced by these."""
 
     from_index: int = Field(ge=0, le=1_000_000)
     steps: tuple[WrittenStep, ...] = Field(max_length=10_000)
 
 
-class MoveRequest(_Body):
+class MoveRequest(Document):
     """1 is the next to be run."""
 
     to: int = Field(ge=1, le=1_000_000)
 
 
-class NoteRequest(_Body):
+class NoteRequest(Document):
     """A sentence about a session, and tags to find it by."""
 
     text: str = Field(default="", max_length=LONGEST_NOTE)
     tags: tuple[Annotated[str, Field(max_length=100)], ...] = Field(default=(), max_length=32)
 
 
-class DeviceRequest(_Body):
+class DeviceRequest(Document):
     """What a verb of a device is given, by name."""
 
     arguments: dict[str, JsonValue] = Field(default_factory=dict)
