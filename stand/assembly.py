@@ -253,6 +253,22 @@ def inputs_of(config: StandConfig, bus: Bus, clock: Clock) -> Inputs | None:
     return Inputs("inputs", bus, register_map("inputs", config.inputs), channels, clock)
 
 
+def device_kinds(config: StandConfig) -> dict[str, str]:
+    """What the stand is made of: name -> kind."""
+    return {
+        "regulator": "regulator",
+        "relays": "relays",
+        **({} if config.heat_module is None else {"heat_module": "output"}),
+        "thermometers": "thermometers",
+        **({} if config.inputs is None else {"inputs": "contacts"}),
+        **({} if config.imager is None else {"imager": "imager"}),
+        **({} if config.flap is None else {"flap": "flap"}),
+        **dict.fromkeys(config.probes, "thermometers"),
+        **dict.fromkeys(config.axes, "axis"),
+        **dict.fromkeys(config.cameras, "camera"),
+    }
+
+
 def register_map(key: str, unit: OnBus) -> RegisterMap:
     """The map of a unit, for its number on the bus; ConfigError when it is missing or wrong."""
     path = packaged("registers", unit.registers, key=f"{key}.registers")

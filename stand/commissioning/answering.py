@@ -8,19 +8,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import AsyncExitStack
 
 from drivers.devices.relays import CAMERA_POWER
 from drivers.wires.camera_settings import GigeCameraSettings
 from drivers.wires.discovery import FoundCamera, cameras_at
 from drivers.wires.modbus_unit import ModbusUnit
-from foundation.clock import WallClock
 from foundation.errors import DeviceError
-from foundation.hub import Hub
-from stand.assembly import Assembly, assemble, register_map
+from stand.assembly import Assembly, register_map
 from stand.config.stand_config import StandConfig
-from stand.running.opening.claim import claimed
-from stand.running.opening.open_stand import close_devices
+from stand.running.opening.open_stand import at_bench
 
 COMMAND = "stand queue add"
 _CAMERA_WAIT_S = 1.0  # for its answer to GVCP's discovery
@@ -34,11 +30,7 @@ async def not_answering(config: StandConfig) -> tuple[str, ...]:
     A camera without supply is not asked, since a run switches it on. InUse when another program has the stand: then
     nothing was asked. ConfigError as `assemble`.
     """
-    async with AsyncExitStack() as stack:
-        await stack.enter_async_context(claimed(config, None, COMMAND))
-        assembly = assemble(config, Hub(), WallClock())
-        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
-        stack.push_async_callback(close_devices, assembly)
+    async with at_bench(config, COMMAND) as assembly:
         devices = assembly.devices
         alone: list[Ask] = [each.open for each in (*devices.probes.values(), *devices.axes.values())]
         if config.flap is not None:

@@ -13,18 +13,15 @@ from functools import partial
 
 from drivers.devices.protocols import Actuator
 from drivers.settings import Identity
-from foundation.clock import WallClock
 from foundation.errors import Unreachable
-from foundation.hub import Hub
-from stand.assembly import Assembly, assemble
+from stand.assembly import Assembly
 from stand.commissioning import host
 from stand.commissioning.camera_line_check import shared_lines
 from stand.commissioning.finding import Finding
 from stand.commissioning.links import Links
 from stand.commissioning.moves import Moves
 from stand.config.stand_config import StandConfig
-from stand.running.opening.claim import claimed
-from stand.running.opening.open_stand import close_devices, made_safe
+from stand.running.opening.open_stand import at_bench, made_safe
 from stand.running.opening.stop import Stop
 
 COMMAND = "stand check"
@@ -44,10 +41,7 @@ async def commission(
     found: list[Finding] = []
     async with AsyncExitStack() as stack:
         stop = await stack.enter_async_context(Stop())
-        await stack.enter_async_context(claimed(config, None, COMMAND))
-        assembly = assemble(config, Hub(), WallClock())
-        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
-        stack.push_async_callback(close_devices, assembly)
+        assembly = await stack.enter_async_context(at_bench(config, COMMAND))
         if has_moves:
             stack.push_async_callback(_made_safe, assembly, stop, found, tell)
             stop.watch(assembly.stand)

@@ -12,9 +12,8 @@ from drivers.devices.regulators.software_regulator import SoftwareRegulator
 from experiments.steps import MoveTo, SetTemperature, Step, number_steps
 from foundation.errors import ConfigError, DeviceError
 from foundation.items import Batch
-from stand.assembly import Assembly
+from stand.assembly import Assembly, device_kinds
 from stand.estimating.estimate import price
-from stand.running.run_desk import device_kinds
 from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb, Missing
 
 Work = Coroutine[None, None, object]
@@ -38,7 +37,7 @@ class ByHand:
         self._assembly = assembly
         self._stand = assembly.stand
         self._heat = heat
-        self._kinds = device_kinds(assembly)
+        self._kinds = device_kinds(assembly.config)
 
     def devices(self, refused: str) -> tuple[DeviceState, ...]:
         """What there is; refused: why nothing is taken now."""

@@ -24,13 +24,11 @@ from foundation.files import write_whole_bytes
 from foundation.hub import Hub
 from foundation.readings import Reading
 from recording.format.images import encode_png
-from stand.assembly import Assembly, assemble, register_map
+from stand.assembly import Assembly, assemble, device_kinds, register_map
 from stand.config.stand_config import StandConfig
 from stand.daemon.by_hand import ByHand
-from stand.running.opening.claim import claimed
-from stand.running.opening.open_stand import close_devices, made_safe
+from stand.running.opening.open_stand import at_bench, made_safe
 from stand.running.opening.stop import Stop
-from stand.running.run_desk import device_kinds
 from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb
 
 COMMAND = "stand device"
@@ -98,7 +96,7 @@ class _Hands:
 
     def __init__(self, assembly: Assembly) -> None:
         self.assembly = assembly
-        self._kinds = device_kinds(assembly)
+        self._kinds = device_kinds(assembly.config)
 
     def check(self, name: str, verb: str) -> None:
         """ConfigError when there is no such device, or it does not know that; nothing was opened then."""
@@ -174,10 +172,7 @@ async def _session(config: StandConfig) -> AsyncGenerator[_Hands]:
     """Locked, and safe at the end."""
     async with AsyncExitStack() as stack:
         stop = await stack.enter_async_context(Stop())
-        await stack.enter_async_context(claimed(config, None, COMMAND))
-        assembly = assemble(config, Hub(), WallClock())
-        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
-        stack.push_async_callback(close_devices, assembly)
+        assembly = await stack.enter_async_context(at_bench(config, COMMAND))
         stack.push_async_callback(_made_safe, assembly, stop)
         stop.watch(assembly.stand)
         yield _Hands(assembly)

@@ -14,7 +14,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError, SessionError
 from foundation.items import Event, Item, StepMark, StepState
 from recording.writing.disk import DiskCalls
-from stand.assembly import Assembly
+from stand.assembly import Assembly, device_kinds
 from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR, Phase
 from stand.running.executing.executor import Executor
@@ -132,7 +132,7 @@ class RunDesk:
         """None takes an order from anybody but the run."""
         return tuple(
             DeviceState(name=name, kind=kind, channels=self._channels(name), refused="a run has the stand")
-            for name, kind in device_kinds(self.assembly).items()
+            for name, kind in device_kinds(self.assembly.config).items()
         )
 
     def pause(self, who: Who, when: When = "now") -> Done:
@@ -202,8 +202,8 @@ class RunDesk:
 
     async def device(self, who: Who, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> Done:
         """Conflict: the run has the stand."""
-        if name not in device_kinds(self.assembly):
-            raise Missing(f"this stand has no device of that name; there are {', '.join(device_kinds(self.assembly))}")
+        if name not in (kinds := device_kinds(self.assembly.config)):
+            raise Missing(f"this stand has no device of that name; there are {', '.join(kinds)}")
         raise Conflict("a run has the stand; pause does not change that, `stand stop` ends the run")
 
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
@@ -287,20 +287,3 @@ def _standing(state: RunState, step_id: str) -> StepStanding:
     if step_id in state.done:
         return "done"
     return "under_way" if step_id == state.under_way else "waiting"
-
-
-def device_kinds(assembly: Assembly) -> dict[str, str]:
-    """What the stand is made of: name -> kind."""
-    devices = assembly.devices
-    return {
-        "regulator": "regulator",
-        "relays": "relays",
-        **({} if devices.heat_module is None else {"heat_module": "output"}),
-        "thermometers": "thermometers",
-        **({} if devices.inputs is None else {"inputs": "contacts"}),
-        **({} if devices.imager is None else {"imager": "imager"}),
-        **({} if assembly.config.flap is None else {"flap": "flap"}),
-        **dict.fromkeys(devices.probes, "thermometers"),
-        **dict.fromkeys(devices.axes, "axis"),
-        **dict.fromkeys(devices.cameras, "camera"),
-    }

@@ -21,7 +21,7 @@ from recording.format.roi import RoiEncoder
 from recording.writing.disk import Disk
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from recording.writing.recorder_settings import VIRTUAL_COMMIT_S
-from stand.assembly import Assembly
+from stand.assembly import Assembly, device_kinds
 from stand.config.stand_config import RecordingConfig, StandConfig
 from stand.estimating.absent import absences
 from stand.running.order import Order
@@ -99,7 +99,9 @@ def recorder_in(
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
-    return Recorder(directory, info, attachments, _kinds(config), hub, clock, settings, encode, disk)
+    # Contacts are kept as those of the relays.
+    kinds = {name: "relays" if kind == "contacts" else kind for name, kind in device_kinds(config).items()}
+    return Recorder(directory, info, attachments, kinds, hub, clock, settings, encode, disk)
 
 
 def _commit_s(recording: RecordingConfig, clock: Clock) -> float:
@@ -118,15 +120,3 @@ def _partial_frames(order: Order) -> RoiEncoder | None:
     from markers.windows import marker_windows  # scipy takes half a second that other runs need not wait for
 
     return RoiEncoder(partial(marker_windows, target=target), recording.whole_every_s)
-
-
-def _kinds(config: StandConfig) -> dict[str, str]:
-    """Device name -> what kind of device it is, for the recorder's topics."""
-    kinds = {name: name for name in ("regulator", "relays", "thermometers")}
-    kinds |= dict.fromkeys(config.cameras, "camera")
-    kinds |= {} if config.heat_module is None else {"heat_module": "output"}
-    kinds |= {} if config.inputs is None else {"inputs": "relays"}  # contacts, as those of the relays
-    kinds |= {} if config.imager is None else {"imager": "imager"}
-    kinds |= {} if config.flap is None else {"flap": "flap"}
-    kinds |= dict.fromkeys(config.probes, "thermometers")
-    return {**kinds, **dict.fromkeys(config.axes, "axis")}

@@ -11,18 +11,21 @@ from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Protocol, TypeVar
 
-from foundation.clock import VirtualClock
+from foundation.clock import VirtualClock, WallClock
 from foundation.errors import StandError, Unreachable
+from foundation.hub import Hub
 from foundation.patience import Patience
 from foundation.tasks import cancelled, watched
 from recording.writing.disk import FILES_LINE, Disk
-from stand.assembly import Assembly
+from stand.assembly import Assembly, assemble
+from stand.config.stand_config import StandConfig
 from stand.fault import Fault
 from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording
 from stand.guarding.rules import Announcements
 from stand.poller import Poller
+from stand.running.opening.claim import claimed
 from stand.running.opening.holds import keep_shut_in_holds
 from stand.running.opening.stop import Stop
 
@@ -318,6 +321,20 @@ async def made_safe(assembly: Assembly, stop: Stop) -> tuple[str, ...]:
     await safety.confirmed(assembly.config.guard.safe_limit_s)
     await safety.close()
     return safety.unconfirmed
+
+
+@asynccontextmanager
+async def at_bench(config: StandConfig, command: str) -> AsyncGenerator[Assembly]:
+    """A stand that is looked at without a run: locked as for one, nothing is open, and at the end every wire is let go.
+
+    InUse when another program has it: then nothing was touched. ConfigError as `assemble`.
+    """
+    async with AsyncExitStack() as stack:
+        await stack.enter_async_context(claimed(config, None, command))
+        assembly = assemble(config, Hub(), WallClock())
+        stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
+        stack.push_async_callback(close_devices, assembly)
+        yield assembly
 
 
 async def close_devices(assembly: Assembly) -> None:
