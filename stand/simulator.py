@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from drivers.camera_preset import CameraPreset
-from drivers.settings import OnBus
 from foundation.addresses import tcp_place
 from foundation.clock import seconds_ns
 from foundation.documents import load_document
@@ -73,6 +72,7 @@ def laboratory_of(
 
 def _bus_of(config: StandConfig) -> dict[str, object]:
     """What answers on the Modbus line, by unit."""
+    module = config.thermometer_module
     return {
         "regulator_unit": config.regulator_unit.unit if config.regulator_unit is not None else None,
         "relays_unit": config.relays.unit if config.relays is not None else None,
@@ -80,8 +80,8 @@ def _bus_of(config: StandConfig) -> dict[str, object]:
         "heat_module_unit": config.heat_module.unit if config.heat_module is not None else None,
         "heat_module_output": config.heat_module.channel if config.heat_module is not None else 0,
         **_inputs_of(config),
-        "thermometers_units": list(config.thermometer_module.units),
-        "thermometers_model": _model_of(config.thermometer_module),
+        "thermometers_units": list(module.units),
+        "thermometers_model": "adam4015" if Path(module.registers).stem == "adam-4015" else "m7015",
         "thermometer_channels": {name: entry.channel for name, entry in config.sensors.items()},
     }
 
@@ -98,21 +98,12 @@ def _lines_of(config: StandConfig, address_of: Callable[[str | None], str | None
             for name, axis in config.axes.items()
         },
         "probes": {
-            name: {
-                "protocol": probe.protocol,
-                "address": address_of(probe.address),
-                "serial_number": probe.serial_number,
-            }
+            name: probe.model_dump(include={"protocol", "serial_number"}) | {"address": address_of(probe.address)}
             for name, probe in config.probes.items()
         },
         "flap": config.flap
         and {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
     }
-
-
-def _model_of(module: OnBus) -> str:
-    """The fake of that map."""
-    return "adam4015" if Path(module.registers).stem == "adam-4015" else "m7015"
 
 
 def _dress_of(camera: SimulatedCamera) -> dict[str, object]:

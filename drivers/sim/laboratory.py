@@ -239,8 +239,8 @@ class Laboratory:
             self.addresses["imager"] = str(self._imager.folder)
         self._publish()
         for name in spec.cameras:
-            is_first = not self.cameras
-            camera = self._camera(name, Scene(SceneSpec(), spec.seed if is_first else spec.seed + _noise_of(name)))
+            seed = spec.seed + (zlib.crc32(name.encode()) if self.cameras else 0)  # two that expose together differ
+            camera = self._camera(name, Scene(SceneSpec(), seed))
             self._closers.append(camera.close)
             camera.start()
             self.cameras[name], self.addresses[name] = camera, camera.address
@@ -365,8 +365,3 @@ def _at_a_free_address(at: Callable[[str], FakeCamera]) -> FakeCamera:
             tries_left -= 1
             if not tries_left:
                 raise
-
-
-def _noise_of(name: str) -> int:
-    """What a camera's noise is seeded with beside the laboratory's seed: two that expose together differ."""
-    return zlib.crc32(name.encode())

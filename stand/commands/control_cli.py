@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, cast
@@ -94,9 +94,10 @@ def pause(
     Example: stand pause && stand continue
     """
     answer = server.order("pause", {"when": "step" if at_next_step else "now"})
-    moving = cast("list[str]", answer.get("moving", []))
+    names = ", ".join(map(one_line, cast("list[str]", answer.get("moving", []))))
+    moving = f"still moving: {names}" if names else "nothing moves"
     when = "pauses when the step under way is done" if at_next_step else "paused"
-    _say(server, answer, f"{when}; `stand continue` ends the pause; {_moving(moving)}")
+    _say(server, answer, f"{when}; `stand continue` ends the pause; {moving}")
 
 
 @app.command("continue")
@@ -267,7 +268,3 @@ def _still(answer: Mapping[str, object]) -> str:
         return "the run continues"
     known = [remedy for reason in reasons if (remedy := for_reason(reason))]
     return "; ".join([f"still held: {', '.join(reasons)}", *known])
-
-
-def _moving(moving: Sequence[str]) -> str:
-    return f"still moving: {', '.join(map(one_line, moving))}" if moving else "nothing moves"

@@ -31,7 +31,8 @@ async def unverified_points(
 
 
 async def _read_back(unit: ModbusUnit, names: tuple[str, ...], remark: str) -> Finding:
-    what, shown, data = _what(names), list[str](), dict[str, object]()
+    what = f"point{'' if len(names) == 1 else 's'} {', '.join(names)}"
+    shown, data = list[str](), dict[str, object]()
     for name in names:
         point = unit.map.points[name]
         try:
@@ -54,10 +55,6 @@ async def _read_back(unit: ModbusUnit, names: tuple[str, ...], remark: str) -> F
     text = f"reads {', '.join(shown)}"
     advice = f"never seen on a unit: {remark}; when it is right, take `unverified` out of the register map"
     return Finding(unit.name, what, "unverified", text, advice, data)
-
-
-def _what(names: tuple[str, ...]) -> str:
-    return f"point {names[0]}" if len(names) == 1 else f"points {', '.join(names)}"
 
 
 def _shown(register_map: RegisterMap, name: str, sample: Sample) -> str:

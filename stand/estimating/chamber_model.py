@@ -124,7 +124,8 @@ def ramps_of(session: Session) -> list[Ramp]:
     for number, mark in enumerate(marks):
         if mark.kind in _SETS and mark.state is StepState.DONE:
             end_s = _disturbed_s(marks[number + 1 :], float(pv[0, -1]) if pv.size else 0.0)
-            ramp = _ramp(_between(pv, mark, end_s), _between(camera, mark, end_s), _set_point_degC(mark))
+            setpoint_degC = float(str(mark.parameters.get("chamber_degC", "nan")))
+            ramp = _ramp(_between(pv, mark, end_s), _between(camera, mark, end_s), setpoint_degC)
             if ramp is not None:
                 found.append(ramp)
     return found
@@ -227,7 +228,3 @@ def _between(column: NDArray[np.float64], mark: StepMark, end_s: float) -> NDArr
 def _disturbed_s(later: Sequence[StepMark], end_s: float) -> float:
     times_ns = (mark.time_ns for mark in later if mark.kind in _DISTURBS and mark.state is StepState.STARTED)
     return next((time_ns / NS_PER_S for time_ns in times_ns), end_s)
-
-
-def _set_point_degC(mark: StepMark) -> float:
-    return float(str(mark.parameters.get("chamber_degC", "nan")))

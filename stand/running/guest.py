@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from foundation.calls import Lane
-from foundation.clock import Clock, VirtualClock, boot_of, utc_offset_ns
+from foundation.clock import VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
 from foundation.errors import StandError, StandTripped
 from foundation.hub import Hub
@@ -180,7 +180,8 @@ class Guest:
         leaving.callback(hub.unsubscribe, holding)
         if before is not None:
             _judge_camera(before, assembly)
-        offsets = OffsetWatch(hub, clock, None if before is None else _gap(before, clock))
+        gap = before and OffsetGap(before.camera.offsets_K, before.last_ns, clock.now_ns())
+        offsets = OffsetWatch(hub, clock, gap)
         leaving.callback(offsets.close)
         allowed = partial(check_plan, config=self.job.order.config)
         executor = Executor(
@@ -289,10 +290,6 @@ class Guest:
         done = f"{len(before.kept.done)} steps are done"
         text = f"recipe {before.order.recipe.name} is resumed, {done}; thermostand {version}"
         log.tell("info", "run.resume", text, self._begin_data())
-
-
-def _gap(before: Interruption, clock: Clock) -> OffsetGap:
-    return OffsetGap(before.camera.offsets_K, before.last_ns, clock.now_ns())
 
 
 def _judge_camera(before: Interruption, assembly: Assembly) -> None:

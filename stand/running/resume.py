@@ -12,6 +12,7 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import merge
+from operator import attrgetter
 from pathlib import Path
 
 from experiments.steps import Capture, PlannedStep
@@ -118,7 +119,8 @@ def _interruption(
     session = Session.open(directory)
     begun = first if isinstance(first, Begun) else _recorded_begun(session)
     lost = _recorded_end(session, entries) if journal.damage else ()  # what else is lost is unknown
-    all_entries = (*with_recorded(entries, _recorded_items(session), _recorded_frames(session)), *lost)
+    items = (*session.steps(), *session.events())
+    all_entries = (*with_recorded(entries, items, _recorded_frames(session)), *lost)
     _check_may_go_on(directory, folded((), all_entries), clear)
     order = _order(session, begun)
     info = SessionInfo.of(session.metadata)
@@ -171,17 +173,10 @@ def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Itera
             change = change_of(item.time_ns, item.data) if item.kind == PLAN_CHANGED else None
             if change is not None and change not in entries:
                 others.append(change)
-    others.sort(key=_instant)
+    instant = attrgetter("time_ns")
+    others.sort(key=instant)
     # Of an instant in which steps are to be done again, their ends before do not count, their frames do.
-    return list(merge(sorted(done, key=_instant), entries, others, key=_instant))
-
-
-def _instant(entry: Entry) -> int:
-    return entry.time_ns
-
-
-def _recorded_items(session: Session) -> tuple[Item, ...]:
-    return (*session.steps(), *session.events())
+    return list(merge(sorted(done, key=instant), entries, others, key=instant))
 
 
 def _recorded_frames(session: Session) -> list[tuple[int, str]]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,17 +71,7 @@ class Columns:
             "low": {name: _numbers(values) for name, values in self.low.items()},
             "high": {name: _numbers(self.high[name]) for name in different},
             "units": dict(self.units),
-            "marks": [
-                {
-                    "time_ns": mark.time_ns,
-                    "end_ns": mark.end_ns,
-                    "level": mark.level,
-                    "kind": mark.kind,
-                    "text": mark.text,
-                    "step_id": mark.step_id,
-                }
-                for mark in self.marks
-            ],
+            "marks": [asdict(mark) for mark in self.marks],
         }
 
 

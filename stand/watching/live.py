@@ -7,7 +7,6 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import typer
 from rich.console import Console
@@ -31,18 +30,6 @@ from stand.watching.panel import panel_lines, plain_line
 _BETWEEN_PANELS_NS = NS_PER_S // 4
 _BETWEEN_LINES_NS = 60 * NS_PER_S
 _TENTH = 0.1  # of a run in virtual time, whose minutes are none
-
-
-class View(Protocol):
-    """Shows moments as often as it likes, and each message at once."""
-
-    def show(self, moment: Moment) -> None:
-        """How it stands."""
-        ...
-
-    def tell(self, line: str) -> None:
-        """What has happened."""
-        ...
 
 
 @contextmanager
@@ -157,6 +144,9 @@ class Foot:
         """Above the panel."""
         style = "red" if line.startswith("error") else "yellow" if line.startswith("warning") else ""
         self._live.console.print(Text(one_line(line), style=style), soft_wrap=True)
+
+
+View = Silent | Lines | Foot  # each shows moments as often as it likes, and every message at once
 
 
 @contextmanager

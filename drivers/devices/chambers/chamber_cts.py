@@ -69,7 +69,7 @@ class Language(ChamberLanguage):
 
     def set_temperature(self, degC: float) -> None:
         """a0 025.0."""
-        self.client.send(*self._asked(f"a0 {_number(degC)}", 1, _expecting("a")))
+        self.client.send(*self._asked(f"a0 {degC:05.1f}", 1, _expecting("a")))
 
     def humidity_off(self) -> None:
         """Its channel differs from unit to unit."""
@@ -117,8 +117,3 @@ def _door_open(text: str) -> bool | None:
 
 def _expecting(word: str) -> Callable[[str], str | None]:
     return lambda text: word if text == word else None
-
-
-def _number(degC: float) -> str:
-    """025.0, -40.0."""
-    return f"{degC:05.1f}"

@@ -350,11 +350,11 @@ class Axis:
         self._identified()
         turn.check()
         self._zero_due = True
-        self._send("home", b"", _homing, turn)
+        self._send("home", b"", lambda status: status.running and status.answers(_COMMAND_HOME), turn)
 
     def _zero(self) -> None:
         """HOME leaves the step counter alone (libximc, command_homezero): zero it, and look whether that came."""
-        self._send("zero", b"", _at_zero)
+        self._send("zero", b"", lambda status: status.position == 0)
         if (position := self._status().position) != 0:
             raise DeviceFault(
                 self.name, f"the step counter could not be set to zero, it is {position / _MICROSTEPS:.2f}"
@@ -366,17 +366,6 @@ def _check(turn: Turn | None) -> None:
     """A stop needs no turn."""
     if turn is not None:
         turn.check()
-
-
-# What shows that a command whose acknowledgement was lost has been carried out:
-
-
-def _homing(status: _Status) -> bool:
-    return status.running and status.answers(_COMMAND_HOME)
-
-
-def _at_zero(status: _Status) -> bool:
-    return status.position == 0
 
 
 def _at_rest(status: _Status) -> bool:

@@ -88,7 +88,8 @@ class DressedRegisters(Registers):
 
     def read(self, address: int, count: int) -> bytes:
         """`count` bytes from `address`, zeros where nothing was written yet; Nack outside bootstrap and file."""
-        if address < _BOOTSTRAP_bytes or (address >= XML_ADDRESS and self._in_xml(address)):
+        is_in_xml = XML_ADDRESS <= address < XML_ADDRESS + len(self._file.file.xml) + 4
+        if address < _BOOTSTRAP_bytes or is_in_xml:
             return super().read(address, count)
         return self._file.memory.read(address, count)
 
@@ -105,9 +106,6 @@ class DressedRegisters(Registers):
         return (*self._wear(), *given)
 
     # ---------------------------------------------------------------------------------------------------- the clothes
-
-    def _in_xml(self, address: int) -> bool:
-        return address < XML_ADDRESS + len(self._file.file.xml) + 4
 
     def _registers_of(self, feature: str) -> tuple[str, ...]:
         return self._file.file.registers(feature) if feature in self._file.file else ()

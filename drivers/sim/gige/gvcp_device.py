@@ -111,7 +111,9 @@ class ControlChannel:
                 case _:
                     raise Nack(Status.NOT_IMPLEMENTED, f"command {request.command:#06x}")
         except Nack as refused:
-            return None if request.command == Command.PACKETRESEND else _refusal(request, refused)
+            if request.command == Command.PACKETRESEND:
+                return None
+            return Ack(request.command, request.req_id, status=refused.status)
         return Ack(request.command, request.req_id, payload)
 
     def _read(self, address: int, count: int) -> bytes:
@@ -152,7 +154,3 @@ class ControlChannel:
         self._registers.put("GevCCP", 0)
         self._registers.put("GevSCPHostPort", 0)
         self._device.control_ended()
-
-
-def _refusal(request: Request, refused: Nack) -> Ack:
-    return Ack(request.command, request.req_id, status=refused.status)

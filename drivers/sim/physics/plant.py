@@ -75,10 +75,6 @@ class OwnPhysics(Protocol):
         ...
 
 
-def _closed(time_ns: int) -> float:
-    return 0.0
-
-
 def _at_zero(time_ns: int) -> float:
     return 0.0
 
@@ -101,7 +97,7 @@ class Plant:
         self.heater_enabled = False
         self.compressor_on = False
         self.cut_out_open = False
-        self.flap_open_at: Callable[[int], float] = _closed
+        self.flap_open_at: Callable[[int], float] = _at_zero
         self.linear_mm_at: Callable[[int], float] = _at_zero
         self.rotary_deg_at: Callable[[int], float] = _at_zero
         self._camera_powered = spec.camera_powered
