@@ -7,9 +7,8 @@ from typing import Literal, get_args
 
 from pydantic import Field
 
-from foundation.documents import Document, parse_document
-from foundation.errors import ConfigError
-from stand.config.private_file import private_text
+from foundation.documents import Document
+from stand.config.private_file import private_document
 
 Cause = Literal[
     "trip",
@@ -48,13 +47,6 @@ class AlertSecrets(Document):
 
 
 def load_secrets(path: Path) -> AlertSecrets:
-    """ConfigError when the file cannot be used, or others may read it; its sentence quotes nothing of the file."""
-    place = f"alerts.secrets: {path}"
-    text = private_text(path, place)
-    try:
-        return parse_document(text, AlertSecrets, str(path))
-    except ConfigError:
-        wrong = (
-            "is not as it should be: `urls:` with a list of Apprise's addresses, and `alive_url:` with an http address"
-        )
-        raise ConfigError(f"{place}: {wrong}") from None  # the reason would quote a secret
+    """ConfigError as private_document."""
+    form = "`urls:` with a list of Apprise's addresses, and `alive_url:` with an http address"
+    return private_document(path, "alerts.secrets", AlertSecrets, form)

@@ -9,9 +9,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from foundation.documents import Document, parse_document
+from foundation.documents import Document
 from foundation.errors import ConfigError
-from stand.config.private_file import private_text
+from stand.config.private_file import private_document
 
 TokenName = Annotated[str, Field(pattern=r"^[\w.@-]{1,64}$")]
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:-]{1,253}$")]
@@ -37,17 +37,11 @@ class TokenFile(Document):
 
 
 def load_tokens(path: Path | None) -> dict[str, str]:
-    """By name; none without a file. ConfigError when it cannot be used, or others may read it; its sentence quotes
-    nothing of the file."""
+    """By name; none without a file. ConfigError as private_document."""
     if path is None:
         return {}
-    place = f"interface.secrets: {path}"
-    text = private_text(path, place)
-    try:
-        return dict(parse_document(text, TokenFile, str(path)).tokens)
-    except ConfigError:
-        wrong = "is not as it should be: `tokens:` with a token of at least 20 characters for each name"
-        raise ConfigError(f"{place}: {wrong}") from None  # the reason would quote a secret
+    form = "`tokens:` with a token of at least 20 characters for each name"
+    return dict(private_document(path, "interface.secrets", TokenFile, form).tokens)
 
 
 def write_tokens(path: Path, tokens: dict[str, str]) -> None:

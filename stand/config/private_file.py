@@ -6,14 +6,24 @@ import os
 import stat
 from pathlib import Path
 
+from foundation.documents import Model, parse_document
 from foundation.errors import ConfigError
 
 _LARGEST_BYTES = 100_000
 
 
-def private_text(path: Path, place: str) -> str:
-    """The file's text; `place` is for messages. ConfigError when it cannot be used, or others may read or write it; its
-    sentence quotes nothing of the file."""
+def private_document(path: Path, key: str, model: type[Model], form: str) -> Model:
+    """The file that `key` of a stand's file names. ConfigError, which says what `form` it should have, when it cannot
+    be used, or others may read or write it; its sentence quotes nothing of the file."""
+    place = f"{key}: {path}"
+    text = _text(path, place)
+    try:
+        return parse_document(text, model, str(path))
+    except ConfigError:
+        raise ConfigError(f"{place}: is not as it should be: {form}") from None  # the reason would quote a secret
+
+
+def _text(path: Path, place: str) -> str:
     try:
         fd = os.open(path.expanduser(), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:
