@@ -7,10 +7,8 @@ daemon does not: each instant is in one session.
 from __future__ import annotations
 
 import asyncio
-import importlib.metadata
 import itertools
 import os
-import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -30,7 +28,7 @@ from recording.writing.disk import Disk
 from recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
 from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly
-from stand.running.session_files import recorder_in, tell_identities
+from stand.running.session_files import info_of, recorder_in, tell_identities
 
 BETWEEN_RUNS = "house"  # in place of a recipe's name
 
@@ -146,16 +144,8 @@ class DayRecord:
 
     def _info(self, name: str) -> SessionInfo:
         config = self._assembly.config
-        return SessionInfo(
-            session_id=name,
-            recipe=BETWEEN_RUNS,
-            operator=config.operator,
-            camera_serial=", ".join(camera.serial_number or "" for camera in config.cameras.values()),
-            software_version=importlib.metadata.version("thermostand"),
-            clock_source="wall",
-            simulated=config.simulation is not None,
-            host=platform.node(),
-        )
+        serials = ", ".join(camera.serial_number or "" for camera in config.cameras.values())
+        return info_of(BETWEEN_RUNS, name, config, serials, self._clock)
 
 
 class _Tap(Hub):

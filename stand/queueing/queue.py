@@ -6,7 +6,7 @@ processes at once. SessionError when the queue cannot be read or written, or a n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,12 +56,8 @@ def entry_of(order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> 
         recipe_text=order.recipe_text,
         target_text=order.target_text,
         added_ns=now_ns,
-        key=asked.key,
-        request=asked.request,
-        added_by=asked.added_by,
-        note=asked.note,
-        tags=asked.tags,
         attended=order.attended,
+        **asdict(asked),
     )
 
 

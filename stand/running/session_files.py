@@ -36,16 +36,15 @@ def session_directory(out: Path, order: Order, clock: Clock) -> Path:
     return next(directory for directory in map(out.joinpath, names) if not os.path.lexists(directory))
 
 
-def info_of(order: Order, directory: Path, assembly: Assembly) -> SessionInfo:
-    """Who records what with which; the camera's serial number is known already."""
-    config = order.config
+def info_of(recipe: str, session: str, config: StandConfig, camera_serial: str, clock: Clock) -> SessionInfo:
+    """Who records what with which."""
     return SessionInfo(
-        session_id=directory.name,
-        recipe=order.recipe.name,
+        session_id=session,
+        recipe=recipe,
         operator=config.operator,
-        camera_serial=camera_serials(assembly),
+        camera_serial=camera_serial,
         software_version=importlib.metadata.version("thermostand"),
-        clock_source="virtual" if isinstance(assembly.clock, VirtualClock) else "wall",
+        clock_source="virtual" if isinstance(clock, VirtualClock) else "wall",
         simulated=config.simulation is not None,
         host=platform.node(),
     )

@@ -7,7 +7,7 @@ Temperatures are in degC, heat capacities in J/K, conductances in W/K. The chamb
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,18 +45,7 @@ class ChamberSpec:
     body_air_W_K: float = 0.19
 
 
-_CONDUCTANCES = (
-    "air_wall_W_K",
-    "wall_laboratory_W_K",
-    "flap_leak_W_K",
-    "heater_air_W_K",
-    "coil_wall_W_K",
-    "coil_air_W_K",
-    "granite_air_W_K",
-    "granite_inside_outside_W_K",
-    "granite_laboratory_W_K",
-    "body_air_W_K",
-)
+_CONDUCTANCES = tuple(field.name for field in fields(ChamberSpec) if field.name.endswith("_W_K"))
 # Heat capacity -> the conductance with which it makes the lag that is drawn.
 _LAGS = {
     "air_J_K": "air_wall_W_K",
