@@ -36,7 +36,7 @@ from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
-from foundation.output import show
+from foundation.output import say, show
 from recording.reading.session import Session
 
 app = App()
@@ -82,7 +82,7 @@ def fit(
             observations = _of_table(sessions)
         else:
             observations = finding.observed(sessions, camera)
-        model = fit_model(observations, degree, form)
+        model = fit_model(observations, degree, form, say)
         evaluation = evaluate(model, observations)
         save_model(model, out)
         bumps = list(model.facts.bumps)

@@ -25,23 +25,26 @@ from foundation.errors import ConfigError, SessionError
 Form = Literal["paper", "thermal"]
 FORMS: tuple[Form, ...] = ("paper", "thermal")
 Fitted = TypeVar("Fitted")
+Say = Callable[[str], None]
 
 
-def fit(observations: Observations, degree: int | None = None, form: Form | None = None) -> DriftModel:
+def fit(
+    observations: Observations, degree: int | None = None, form: Form | None = None, say: Say = lambda sentence: None
+) -> DriftModel:
     """The model of these sessions.
 
     form: None takes the one that predicts better what was left out: temperatures between others and, where these were
     recorded, frames on the way and after switching on; the paper's if both do;
-    sessions without the telemetry that the thermal form needs have the paper's. degree: of the paper's form, which it
-    implies. The model has the form that was not taken as `other`, where the sessions support it. SessionError when
-    they cannot support what was asked for, or a degree was given for thermal.
+    sessions that support one of them only have that. degree: of the paper's form, which it implies. The model has the
+    form that was not taken as `other`, where the sessions support it; else `say` gets the sentence that says why they
+    do not. SessionError when they cannot support what was asked for, or a degree was given for thermal.
 
     It is fitted around steps that no thermal state explains (`facts.bumps`): frames on the other side of one count as
     if the camera had not been moved, and are as uncertain as the step is.
     """
     check_request(degree, form)
     bumps = find_bumps(observations)
-    return _around(bumps, _fitted(around_bumps(observations, bumps), degree, form))
+    return _around(bumps, _fitted(around_bumps(observations, bumps), degree, form, say))
 
 
 def _around(bumps: tuple[Bump, ...], model: DriftModel) -> DriftModel:
@@ -54,24 +57,34 @@ def _around(bumps: tuple[Bump, ...], model: DriftModel) -> DriftModel:
             return model
 
 
-def _fitted(observations: Observations, degree: int | None, form: Form | None) -> DriftModel:
-    if form == "thermal":
-        _check_histories(observations)
-        thermal = fit_thermal(observations)
-        return replace(thermal, other=_or_none(lambda: fit_paper(observations)))
-    paper = fit_paper(observations, degree)
-    # When it was not asked for, what the paper's form lacks stands in the report.
-    thermal = _or_none(lambda: fit_thermal(observations)) if _has_histories(observations) else None
-    if thermal is None or form == "paper" or degree is not None:
-        return replace(paper, other=thermal)
-    return better(_asked_on_the_way(observations, paper, thermal), thermal)
+def _fitted(observations: Observations, degree: int | None, form: Form | None, say: Say) -> DriftModel:
+    asked = form if degree is None else "paper"
+    paper = _or_refusal(lambda: fit_paper(observations, degree))
+    thermal = _or_refusal(lambda: _fit_thermal(observations))
+    if asked is None and isinstance(paper, PaperModel) and isinstance(thermal, ThermalModel):
+        return better(_asked_on_the_way(observations, paper, thermal), thermal)
+    is_thermal = asked == "thermal" or (asked is None and isinstance(thermal, ThermalModel))
+    used, name, other = (thermal, "paper", paper) if is_thermal else (paper, "thermal", thermal)
+    if isinstance(used, SessionError):
+        raise used
+    if not isinstance(other, SessionError):
+        return replace(used, other=other)
+    if asked is None:
+        say(f"the {name} form could not be fitted: {other}")
+    return used
 
 
-def _or_none(fitted: Callable[[], Fitted]) -> Fitted | None:
+def _or_refusal(fitted: Callable[[], Fitted]) -> Fitted | SessionError:
     try:
         return fitted()
-    except SessionError:
-        return None
+    except SessionError as error:
+        return error
+
+
+def _fit_thermal(observations: Observations) -> ThermalModel:
+    if not any(history.has_ambient for history in observations.histories):
+        raise SessionError("the sessions have no history of the air near the camera; the thermal form needs it")
+    return fit_thermal(observations)
 
 
 def check_request(degree: int | None, form: Form | None) -> None:
@@ -116,12 +129,3 @@ def _predicts_better(paper: Candidate, thermal: Candidate) -> bool:
 
 def _comparable(one: Candidate, other: Candidate) -> bool:
     return bool(np.array_equal(one.fold_chamber_degC, other.fold_chamber_degC))
-
-
-def _has_histories(observations: Observations) -> bool:
-    return bool(observations.histories) and any(history.has_ambient for history in observations.histories)
-
-
-def _check_histories(observations: Observations) -> None:
-    if not _has_histories(observations):
-        raise SessionError("the sessions have no history of the air near the camera; the thermal form needs it")

@@ -26,7 +26,7 @@ from compensation.observations import Observations, concatenate
 from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError
 
-from .reservoirs import cycle, reference, session, warm_up
+from .reservoirs import Part, cycle, reference, session, warm_up
 from .synthetic import observations as without_histories
 from .synthetic import quadratic
 
@@ -203,3 +203,16 @@ def test_what_the_thermal_form_needs_is_reported(night: Seen):
     silent = replace(night[0], air_degC=np.full(len(night[0].frame), np.nan))
     with pytest.raises(SessionError, match="no air temperature"):
         fit_thermal(silent)
+
+
+def test_a_night_that_only_one_form_can_be_fitted_to_has_that_form_and_says_what_the_other_lacks():
+    """Two set-points are too few for a polynomial; frames on the way to others teach the thermal form."""
+    way = [Part(air_degC, 2700, role="warm_up", frames=6, interval_s=300) for air_degC in (34.0, 17.0)]
+    observed = session([*reference(), way[0], Part(45.0, 2700, role="fit", frames=5), way[1]])[0]
+    said: list[str] = []
+    model = fit(observed, say=said.append)
+    assert (model.form, model.other) == ("thermal", None)
+    (sentence,) = said
+    assert sentence.startswith("the paper form could not be fitted: a fit needs frames at 3 chamber temperatures")
+    with pytest.raises(SessionError, match="a fit needs frames at 3 chamber temperatures"):
+        fit(observed, form="paper")
