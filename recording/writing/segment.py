@@ -291,7 +291,8 @@ def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> None:
     writer = McapWriter(compression, CHUNK_BYTES)
     size_bytes = source.stat().st_size
     with source.open("rb") as file:
-        file.seek(len(MCAP0_MAGIC))
+        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise ValueError(f"{source}: not an MCAP file")
         opcode = 0
         while opcode != Opcode.DATA_END:  # behind it is the index
             opcode, length = RECORD.unpack(file.read(RECORD.size))

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType
 from recording.format.layout import segment_metadata
 from recording.format.messages import CLASSES, EVENT, LOG
 from recording.writing.home import FolderLost
-from recording.writing.segment import Record, SeriesForm, Topic
+from recording.writing.segment import Record, SeriesForm, Topic, merge_chunks
 from recording.writing.series import Series, next_number
 from tests.recording.disks import ext4, limit_files, run, tmpfs
 
@@ -133,6 +133,14 @@ def test_a_disk_without_room_for_the_copy_keeps_the_segment_as_it_was_committed(
         assert len(chunks(path)) == 100
         assert messages(path) == all_records(100, 3000)
         assert [found.name for found in path.parent.iterdir()] == ["0000.mcap"]
+
+
+def test_a_file_that_is_no_mcap_is_not_merged_and_says_so(tmp_path):
+    source = tmp_path / "0000.mcap.part"
+    source.write_bytes(bytes(100))
+    with pytest.raises(ValueError, match="not an MCAP file"):
+        merge_chunks(source, tmp_path / "0000.mcap", CompressionType.ZSTD)
+    assert [found.name for found in tmp_path.iterdir()] == [source.name]
 
 
 def test_a_name_that_is_taken_is_not_used_again_whatever_it_ends_in(tmp_path):
