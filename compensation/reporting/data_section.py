@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from compensation.reporting.numbers import Numbers, SessionNumbers, UnusableFrames
 from compensation.reporting.page import Facts, Heading, Paragraph, Part, Table
 
-_DOUBTFUL_BY_CHANCE = 0.1
-"""Of the frames, at most."""
+_DOUBTFUL_BY_CHANCE = 0.02
+"""Of the frames, at most: of 200 with noise alone 1 was doubtful (docs/decisions.md)."""
 _LISTED_REASONS, _LISTED_FRAMES = 30, 8
 
 
@@ -38,7 +38,7 @@ def _session(session: SessionNumbers, numbers: Numbers) -> list[tuple[str, str]]
         ("Camera's temperature", "not known" if math.isnan(low) else f"{low:.2f} to {high:.2f} °C"),
         ("Markers", _markers(session, numbers)),
     ]
-    if session.doubtful > _DOUBTFUL_BY_CHANCE * session.frames:
+    if session.doubtful > max(1.0, _DOUBTFUL_BY_CHANCE * session.frames):
         lines.append(("Noise", _doubt(session)))
     if session.incomplete_segments:
         lines.append(("Not read", f"{session.incomplete_segments} segments that were not finished"))

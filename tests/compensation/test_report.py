@@ -21,6 +21,7 @@ from compensation.drift.terms import Origin, features
 from compensation.history.states import States
 from compensation.observations import Observations
 from compensation.reporting.compensation_section import uncertainty_section
+from compensation.reporting.data_section import data_section
 from compensation.reporting.drawing.fit_figures import enlarged, measured_against_model
 from compensation.reporting.extras import Extras
 from compensation.reporting.formula import formula_of
@@ -362,3 +363,14 @@ def test_the_residuals_have_a_scale_of_their_own():
     scale, bar_px = enlarged(0.005, 2448)
     assert (scale, bar_px) == (20_000, 0.01)
     assert 0.5 < scale * 0.005 / (0.06 * 2448) <= 1
+
+
+def test_doubtful_frames_are_named_when_they_are_more_than_noise_alone_gives(numbers: Numbers):
+    """1 of 200 frames of noise alone is doubtful."""
+
+    def says_doubtful(frames: int, doubtful: int) -> bool:
+        (session, *_) = numbers.sessions
+        own = replace(numbers, sessions=(replace(session, frames=frames, doubtful=doubtful),), unusable=())
+        return "frames are not described by" in page_of("", list(data_section(own)))
+
+    assert [says_doubtful(*case) for case in ((60, 1), (60, 2), (1000, 20), (1000, 21))] == [False, True, False, True]
