@@ -25,11 +25,13 @@ from numpy.typing import NDArray
 from markers.band import NARROW_SIGMA, WIDE_EXCESS, WIDE_SIGMA, Strangeness, excess_px2, strangeness
 from markers.bootstrap import Candidates, disc_sizes_px, find_candidates
 from markers.edge_fit import EdgeFit, Flag, fit_edges
-from markers.edge_model import B0, F0, M11, M12, M22, SIGMA, EdgeState
+from markers.edge_model import B0, F0, SIGMA, EdgeState
 from markers.expected import expected_edges, implied_edges
+from markers.following import has_followed, rows_round, still_there
 from markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px, project
 from markers.light import under_common_light
 from markers.noise import Image, Noise
+from markers.pixels import Mask, Picture, picture_of
 from markers.refit import refit_edges
 from markers.sandwich import SAMPLED_MARKERS
 from markers.target import Target
@@ -41,8 +43,10 @@ __all__ = [
     "Image",
     "Noise",
     "detect",
+    "follow",
     "grey_image",
     "nothing_found",
+    "rows_to_follow",
 ]
 
 Float = NDArray[np.float64]
@@ -55,10 +59,6 @@ _SIZE_TOLERANCE = 1.35
 _PLACE_TOLERANCE_PITCH = 0.2
 _FLAT_PART = 0.25
 """Of the tolerance: when all are so near to the homography, nothing has to be bent to tell which are in their place."""
-_TRACKED_PART = 0.9
-_TRACKED_STEP_PX = 5.0
-_GLANCE_BLURS = 3.0
-_GLANCE_CONTRAST = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,17 +109,41 @@ def detect(
     median marker. watch: gets the part of a search that is done, 0 to 1. Raises DetectionError when the target cannot
     be identified beyond doubt.
     """
-    grey = grey_image(image)
+    grey = picture_of(grey_image(image))
     if previous is not None:
-        if len(previous.flags) != target.count:
-            raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
-        if _still_there(grey, previous, _reach(target)[:, :1]):
-            with suppress(DetectionError):
-                sampled = target.count if previous.is_doubtful else SAMPLED_MARKERS
-                tracked = _fit_in_band(grey, target, previous.state, noise, previous.band_sigma, sampled)
-                if tracked is not None and _has_followed(tracked[0], previous):
-                    return _doubted(tracked[0], previous.excess_px2)
-    return _search(grey, target, None if previous is None else previous.homography, noise, watch)
+        followed = _follow(grey, target, previous, noise)
+        if followed is not None:
+            return followed
+    return _search(grey_image(image), grey, target, None if previous is None else previous.homography, noise, watch)
+
+
+def rows_to_follow(previous: Detection, target: Target, height: int) -> Mask:
+    """The rows (height,) of the next frame that `follow` looks at, if all goes on as before."""
+    reach = _reach(target)[:, 1]
+    return rows_round(previous.state, np.isfinite(previous.chi), reach, previous.band_sigma, height)
+
+
+def follow(
+    image: NDArray[np.uint8], rows: Mask, target: Target, previous: Detection, noise: Noise | None = None
+) -> Detection | None:
+    """What `detect` finds by going on from `previous`, from an image (height, width) of which only `rows` are there.
+    None where that takes more of it, or another way, to find out: `detect` does it in the whole image."""
+    picture = picture_of(image, rows)
+    followed = _follow(picture, target, previous, noise)
+    return None if picture.missed[0] else followed
+
+
+def _follow(picture: Picture, target: Target, previous: Detection, noise: Noise | None) -> Detection | None:
+    if len(previous.flags) != target.count:
+        raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
+    if not still_there(picture, previous.state, np.isfinite(previous.chi), _reach(target)[:, :1]):
+        return None
+    sampled = target.count if previous.is_doubtful else SAMPLED_MARKERS
+    with suppress(DetectionError):
+        tracked = _fit_in_band(picture, target, previous.state, noise, previous.band_sigma, sampled)
+        if tracked is not None and has_followed(tracked[0].centres_px, previous.centres_px):
+            return _doubted(tracked[0], previous.excess_px2)
+    return None
 
 
 def nothing_found(target: Target) -> Detection:
@@ -154,7 +178,12 @@ def grey_image(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:
 
 
 def _search(
-    grey: Image, target: Target, previous: Float | None, noise: Noise | None, watch: Callable[[float], None]
+    grey: Image,
+    picture: Picture,
+    target: Target,
+    previous: Float | None,
+    noise: Noise | None,
+    watch: Callable[[float], None],
 ) -> Detection:
     """Look for the target at every scale it may have; the failure that came nearest is the one reported."""
     nearest: DetectionError | None = None
@@ -164,7 +193,7 @@ def _search(
         candidates = find_candidates(grey, target, size_px)
         try:
             identified = identify(candidates, target, previous, grey.shape)
-            return _first_fit(grey, target, candidates, identified, noise)
+            return _first_fit(picture, target, candidates, identified, noise)
         except DetectionError as error:
             if nearest is None or error.found > nearest.found:
                 nearest = error
@@ -174,7 +203,7 @@ def _search(
 
 
 def _first_fit(
-    grey: Image, target: Target, candidates: Candidates, identified: Identified, noise: Noise | None
+    picture: Picture, target: Target, candidates: Candidates, identified: Identified, noise: Noise | None
 ) -> Detection:
     """Fit from the homography's ellipses, put where the candidates are and scaled to the size they have."""
     start = expected_edges(identified.homography, target)
@@ -183,7 +212,7 @@ def _first_fit(
     scale = float(np.median(np.sqrt(areas / np.pi) / start.radii_px()[seen]))
     start.parameters[seen, :2] = candidates.centres_px[identified.candidate[seen]]
     start = EdgeState(start.parameters, start.scale_px * scale)
-    detection = _fit(grey, target, start, noise)
+    detection = _fit(picture, target, start, noise)
     if detection is None:
         raise DetectionError(
             f"found {seen.sum()} of {target.count} markers of {target.name}, but too few have a clean edge",
@@ -192,15 +221,15 @@ def _first_fit(
     return detection
 
 
-def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> Detection | None:
+def _fit(picture: Picture, target: Target, start: EdgeState, noise: Noise | None) -> Detection | None:
     """The fit in a wide band; where its residuals hang together, in a narrow one if that leaves less variance."""
-    found = _fit_in_band(grey, target, start, noise, WIDE_SIGMA)
+    found = _fit_in_band(picture, target, start, noise, WIDE_SIGMA)
     if found is None:
         return None
     wide, fit = found
     if not wide.is_doubtful:
         return wide
-    again = _fit_in_band(grey, target, wide.state, noise, NARROW_SIGMA, target.count)
+    again = _fit_in_band(picture, target, wide.state, noise, NARROW_SIGMA, target.count)
     if again is None:
         return wide
     narrow, narrow_fit = again
@@ -210,7 +239,7 @@ def _fit(grey: Image, target: Target, start: EdgeState, noise: Noise | None) -> 
 
 
 def _fit_in_band(
-    grey: Image,
+    picture: Picture,
     target: Target,
     start: EdgeState,
     noise: Noise | None,
@@ -220,13 +249,13 @@ def _fit_in_band(
     """The fit from `start`, judged; None when fewer markers than the target demands have a credible centre. sampled:
     how many markers say whether residuals hang together, at first."""
     model = noise or Noise()
-    fit = fit_edges(grey, start, model, _reach(target), band_sigma, sampled)
+    fit = fit_edges(picture, start, model, _reach(target), band_sigma, sampled)
     good = np.isfinite(fit.chi) & _has_contrast(fit.state, target, model)
     if good.sum() < target.least_markers:
         return None
     homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
     expected = expected_edges(homography, target)
-    placed = good & _in_its_place(fit.state, homography, expected, target, good) & _within_image(fit.state, grey)
+    placed = good & _in_its_place(fit.state, homography, expected, target, good) & _within_image(fit.state, picture)
     if placed.sum() < target.least_markers:
         return None
     if placed.sum() < good.sum():
@@ -234,8 +263,8 @@ def _fit_in_band(
         expected = expected_edges(homography, target)
     detection, strange = _judged(fit, placed, homography, expected, band_sigma, relative=noise is None)
     if sampled < target.count and strange.is_suspect():
-        return _fit_in_band(grey, target, fit.state, noise, band_sigma, target.count)
-    return _refitted(detection, fit, grey, target, model), fit
+        return _fit_in_band(picture, target, fit.state, noise, band_sigma, target.count)
+    return _refitted(detection, fit, picture, target, model), fit
 
 
 def _doubted(detection: Detection, excess: Float) -> Detection:
@@ -289,7 +318,7 @@ def _grown(covariance: Float, growth: Float) -> Float:
     return covariance * np.sqrt(np.outer(growth, growth))
 
 
-def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, noise: Noise) -> Detection:
+def _refitted(detection: Detection, fit: EdgeFit, picture: Picture, target: Target, noise: Noise) -> Detection:
     """The detection with its poor markers measured again from what looks clean of them, where that is enough."""
     clean = detection.flags == 0
     poor = np.flatnonzero((detection.flags & (Flag.POOR_FIT | Flag.BORDER | Flag.MISSING)) == Flag.POOR_FIT)
@@ -300,7 +329,7 @@ def _refitted(detection: Detection, fit: EdgeFit, grey: Image, target: Target, n
     scaled = Noise(noise.floor_DN2 * usual**2, noise.slope_DN * usual**2)
     patience = float(np.median(fit.misfit[clean])) / usual
     again = refit_edges(
-        grey, implied.state, implied.spread, scaled, _reach(target)[poor], patience, detection.band_sigma
+        picture, implied.state, implied.spread, scaled, _reach(target)[poor], patience, detection.band_sigma
     )
     credible = (again.chi < _POOR_CHI) & _has_contrast(again.state, target, scaled)
     which = poor[credible]
@@ -353,36 +382,9 @@ def _in_its_place(
     return (off_px < limit_px) & (ratio < _SIZE_TOLERANCE) & (ratio > 1 / _SIZE_TOLERANCE)
 
 
-def _within_image(state: EdgeState, grey: Image) -> NDArray[np.bool_]:
+def _within_image(state: EdgeState, picture: Picture) -> NDArray[np.bool_]:
     """Whether the whole outline is in the image, give or take its blur."""
-    height, width = grey.shape
+    height, width = picture.shape
     margin = state.half_extents_px() - state.parameters[:, SIGMA, None]
     centres = state.centres_px()
     return np.all((centres - margin >= -0.5) & (centres + margin <= [width - 0.5, height - 0.5]), axis=1)
-
-
-def _still_there(grey: Image, before: Detection, inwards: Float) -> bool:
-    """Whether the markers still look as they did: a glance at 16 pixels on either side of each outline, not nearer to
-    the centre than `inwards` (N, 1) radii. Much cheaper than a fit that ends nowhere because the target has moved.
-    """
-    state, p = before.state, before.state.parameters
-    angle = np.arange(16) * (2 * np.pi / 16)
-    towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    bend = p[:, M11, None] * towards[:, 0] ** 2 + p[:, M22, None] * towards[:, 1] ** 2
-    radius = state.scale_px[:, None] / np.sqrt(bend + 2 * p[:, M12, None] * towards[:, 0] * towards[:, 1])
-    margin = np.minimum(_GLANCE_BLURS * p[:, SIGMA, None], np.minimum(0.6, 1 - inwards) * radius)
-    limits = np.array(grey.shape[::-1]) - 1
-    levels: list[Float] = []
-    for along in (radius + margin, radius - margin):
-        place = np.rint(p[:, None, :2] + along[:, :, None] * towards).astype(int)
-        column, row = np.moveaxis(np.clip(place, 0, limits), 2, 0)
-        levels.append(grey[row, column].mean(axis=1))
-    unchanged = (levels[0] - levels[1]) / state.contrast_DN() > _GLANCE_CONTRAST
-    seen = np.isfinite(before.chi)
-    return bool(unchanged[seen].mean() >= _TRACKED_PART)
-
-
-def _has_followed(now: Detection, before: Detection) -> bool:
-    """Whether tracking stayed on the same markers: about as many, and none far from where it was."""
-    moved = np.linalg.norm(now.centres_px - before.centres_px, axis=1)
-    return bool(now.found >= _TRACKED_PART * before.found and np.nanmax(moved) < _TRACKED_STEP_PX)

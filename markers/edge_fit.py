@@ -27,8 +27,8 @@ from markers.newton import (
     no_belief,
     settle,
 )
-from markers.noise import Image, Noise, full_scale_DN
-from markers.pixels import Bytes, Pixels, bytes_of, empty_pixels
+from markers.noise import Noise
+from markers.pixels import Picture, Pixels, empty_pixels
 from markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
 from markers.sectors import misfits
 
@@ -82,7 +82,7 @@ class EdgeFit:
 
 
 def fit_edges(
-    image: Image,
+    image: Picture,
     start: EdgeState,
     noise: Noise,
     reach: Float,
@@ -91,8 +91,7 @@ def fit_edges(
 ) -> EdgeFit:
     """Fit every marker of `start`. `reach` (N, 2): from where to where, in radii from the centre, a marker's pixels may
     lie, so that its band ends half way to its hole and to the neighbours. band_sigma: half width of the band, blurs.
-    sampled: about how many markers are looked at for `scatter`. The image is only read. Raises ValueError for images
-    that are not contiguous.
+    sampled: about how many markers are looked at for `scatter`. The image is only read.
     """
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
@@ -103,8 +102,8 @@ def fit_edges(
         np.empty(count, np.uint8),
     )
     _fit_all(
-        bytes_of(image), parameters, start.scale_px, np.asarray(reach, np.float64),
-        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start, band_sigma)),
+        image, parameters, start.scale_px, np.asarray(reach, np.float64),
+        (noise.floor_DN2, noise.slope_DN), image.full_scale_DN - 1, empty_pixels(room(image, start, band_sigma)),
         band_sigma, max(1, count // sampled),
         covariance, quality, scatter, flags,
     )  # fmt: skip
@@ -113,16 +112,16 @@ def fit_edges(
     )
 
 
-def room(image: Image, start: EdgeState, band_sigma: float) -> int:
+def room(image: Picture, start: EdgeState, band_sigma: float) -> int:
     """Pixels of the largest marker with its band, when it turns out half as large again and six times as blurred."""
     side = 3 * start.half_extents_px() + 12 * np.maximum(band_sigma * start.parameters[:, SIGMA, None], LEAST_BAND_PX)
-    return int(min(np.nanmax(np.prod(side + 3, axis=1), initial=1), image.size))
+    return int(min(np.nanmax(np.prod(side + 3, axis=1), initial=1), image.shape[0] * image.shape[1]))
 
 
 def _compiled_fit(sources: str) -> Callable[..., None]:
     @entry
     def fit_all(
-        image: Bytes,
+        image: Picture,
         parameters: Float,
         scale: Float,
         reach: Float,

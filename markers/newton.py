@@ -26,7 +26,7 @@ from markers.edge_model import (
     Variance,
     normal_equations,
 )
-from markers.pixels import SHARE, VALUE, Bytes, Gathered, Limits, Pixels, U, V, gather
+from markers.pixels import SHARE, VALUE, Gathered, Limits, Picture, Pixels, U, V, gather
 from markers.sectors import SECTORS, Bools, all_kept, number_of, set_aside
 
 LEAST_BAND_PX = 3.5
@@ -89,7 +89,7 @@ def no_belief() -> Belief:
 
 @compiled
 def settle(
-    image: Bytes,
+    image: Picture,
     p: Float,
     scale: float,
     reach: Float,
@@ -165,7 +165,7 @@ def is_short(length_px: float, gain: float, is_near: bool) -> bool:
 
 @compiled
 def look(
-    image: Bytes, p: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels, belief: Belief
+    image: Picture, p: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels, belief: Belief
 ) -> Gathered:
     """Gather the pixels round the outline of `p`, without those of sectors that are not kept."""
     gathered = gather(image, p[:2], p[M11:SIGMA], scale, limits, ceiling, pixels)

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from markers.compiled import compiled
-from markers.noise import Image
+from markers.noise import Image, full_scale_DN
 
 Float = NDArray[np.float64]
 Columns = NDArray[np.int64]
 Single = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
-"""An image (height, width, 1 or 2 bytes of a pixel, the low one first)."""
+Mask = NDArray[np.bool_]
 
 CORE, GROUND, DISC = range(3)
 U, V, VALUE, SHARE, RESIDUAL, RISE = range(6)
@@ -62,13 +62,37 @@ class Gathered(NamedTuple):
     cut: bool
 
 
-def bytes_of(image: Image) -> Bytes:
+class Picture(NamedTuple):
+    """A grey image as the fit sees it. samples: (height, width, 1 or 2 bytes of a pixel, the low one first).
+    full_scale_DN: the largest value a pixel can have. rows: (height,), those that are there. missed: (1,), set when
+    another one was looked for, so that the results do not count."""
+
+    samples: Bytes
+    full_scale_DN: int
+    rows: Mask
+    missed: Mask
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.samples.shape[0], self.samples.shape[1]
+
+    def values_DN(self, row: Columns, column: Columns) -> Columns:
+        """The pixels there."""
+        self.missed[0] |= not self.rows[row].all()
+        low = self.samples[row, column, 0].astype(np.int64)
+        return low if self.samples.shape[2] == 1 else low + 256 * self.samples[row, column, 1]
+
+
+def picture_of(image: Image, rows: Mask | None = None) -> Picture:
     """The image for `gather`: one type for the compiler, whatever the image's depth and whether or not the caller may
-    write it. A copy only of an image that is not contiguous, or of a machine whose high bytes come first."""
+    write it. A copy only of an image that is not contiguous, or of a machine whose high bytes come first. rows:
+    (height,), those of the image that are there, which must be of 8 bit then: other depths are seen by all pixels."""
     low_first = np.ascontiguousarray(image, image.dtype.newbyteorder("<"))
     view = low_first.view(np.uint8).reshape(*image.shape, image.itemsize)
     view.flags.writeable = False
-    return view
+    is_there = np.ones(len(image), np.bool_) if rows is None else rows
+    return Picture(view, full_scale_DN(image), is_there, np.zeros(1, np.bool_))
 
 
 def empty_pixels(capacity: int) -> Pixels:
@@ -78,18 +102,19 @@ def empty_pixels(capacity: int) -> Pixels:
 
 @compiled
 def gather(
-    image: Bytes, centre: Float, shape: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels
+    image: Picture, centre: Float, shape: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels
 ) -> Gathered:
     """Fill `pixels` from the image, row by row, with those whose F lies in `limits`; `shape` is m11, m12, m22.
 
     Saturated ones get the share 0 (glare), unless they are a quarter of the ground or of the disc: then the picture
     is overexposed, and clipping shifts the outline but not the centre.
     """
-    height, width, size = image.shape
+    samples, rows, missed = image.samples, image.rows, image.missed
+    height, width, size = samples.shape
     room, table = pixels.table.shape[2], pixels.table.reshape(pixels.table.size)
     count = pixels.counts
     count[:] = 0
-    seen, cut, flat = 0, False, image.reshape(image.size)
+    seen, cut, flat = 0, False, samples.reshape(samples.size)
     pixels.origin[0], pixels.origin[1] = round(centre[0]), round(centre[1])
     reach = limits.ground * scale * math.sqrt(shape[0] / (shape[0] * shape[2] - shape[1] * shape[1]))
     ends = np.empty(len(_PARTS) + 1, np.int64)
@@ -98,6 +123,9 @@ def gather(
         if ends[0] < ends[-1] and (row < 0 or row >= height or ends[0] < 0 or ends[-1] > width):
             cut = True
         if row < 0 or row >= height:
+            continue
+        if not rows[row]:
+            missed[0] = True
             continue
         for part in range(len(_PARTS)):
             begin, end, region = max(ends[part], 0), min(ends[part + 1], width), _PARTS[part]

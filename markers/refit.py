@@ -19,8 +19,8 @@ from markers.compiled import compiled, digest, entry
 from markers.edge_fit import room
 from markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
 from markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
-from markers.noise import Image, Noise, full_scale_DN
-from markers.pixels import Bytes, Pixels, bytes_of, empty_pixels
+from markers.noise import Noise
+from markers.pixels import Picture, Pixels, empty_pixels
 from markers.sectors import SECTORS, Bools, all_kept, number_of, sector_misfits
 
 _LEAST_SECTORS = 13
@@ -43,7 +43,7 @@ class Refit:
 
 
 def refit_edges(
-    image: Image, start: EdgeState, spread: Float, noise: Noise, reach: Float, patience: float, band_sigma: float
+    image: Picture, start: EdgeState, spread: Float, noise: Noise, reach: Float, patience: float, band_sigma: float
 ) -> Refit:
     """Fit markers from the ellipses `start` that the others imply. spread: (N, 4), standard deviations of their m11,
     m12, m22 and sigma. noise: such that clean markers have chi 1. patience: how much more than noise clean markers'
@@ -52,8 +52,8 @@ def refit_edges(
     parameters = np.ascontiguousarray(start.parameters).copy()
     covariance, chi = np.empty((count, 2, 2)), np.empty(count)
     _refit_all(
-        bytes_of(image), parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
-        (noise.floor_DN2, noise.slope_DN), full_scale_DN(image) - 1, empty_pixels(room(image, start, band_sigma)),
+        image, parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
+        (noise.floor_DN2, noise.slope_DN), image.full_scale_DN - 1, empty_pixels(room(image, start, band_sigma)),
         _GREATEST_MISFIT * max(patience, 1.0), band_sigma, covariance, chi,
     )  # fmt: skip
     return Refit(EdgeState(parameters, start.scale_px), covariance, chi)
@@ -106,7 +106,7 @@ def drop_neighbours(kept: Bools) -> None:
 def _compiled_refit(sources: str) -> Callable[..., None]:
     @entry
     def refit_all(
-        image: Bytes,
+        image: Picture,
         parameters: Float,
         scale: Float,
         reach: Float,

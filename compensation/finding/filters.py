@@ -9,7 +9,7 @@ from markers.compiled import compiled
 
 Bytes = NDArray[np.uint8]
 
-_NONE, _LEFT, _ABOVE, _AVERAGE, _PAETH = range(5)
+_NONE, LEFT, _ABOVE, _AVERAGE, _PAETH = range(5)
 _TOGETHER = 4
 
 
@@ -79,7 +79,7 @@ def _undo_one(kind: int, source: Bytes, sample_bytes: int, above: Bytes, out: By
     if kind == _NONE:
         for x in range(width):
             out[x] = source[x]
-    elif kind == _LEFT:
+    elif kind == LEFT:
         for x in range(min(sample_bytes, width)):
             out[x] = source[x]
         for x in range(sample_bytes, width):

@@ -17,18 +17,22 @@ from markers.compiled import compiled
 
 Words = NDArray[np.uint64]
 Bytes = NDArray[np.uint8]
+Places = NDArray[np.int64]
 
 UNFIT = -1
-MOST_AT_ONCE = 4
-"""Bytes that one entry of the table can give; what `inflate` writes to has room for so many beyond the wanted size."""
+_LITERALS_OF_ENTRY = 4
+_LOOKS = 5  # in a word of 64 bits, so that a code of 15 is left whole
+MOST_AT_ONCE = _LOOKS * _LITERALS_OF_ENTRY + 1
+"""Bytes that a word can give; what `inflate` writes to has room for so many beyond the wanted size."""
 
 _INDEX_BITS = 10
 _ENTRIES = 1 << _INDEX_BITS
-_LOOKS = 5  # in a word of 64 bits, so that a code of 15 is left whole
 _LONGEST_CODE = 15
 _LITERALS, _END = 256, 256
 _CODES = 288
 _DYNAMIC, _FIXED = 2, 1
+_EMPTY_STORED = 0xFFFF0000
+"""Length and its complement (3.2.4)."""
 _ORDER = np.array([16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15])
 """In which the lengths of the codes for code lengths are written (3.2.7)."""
 
@@ -115,6 +119,73 @@ def inflate(stream: Stream, out: Bytes, begin: int, wanted: int) -> int:
 
 
 @compiled
+def inflate_two(one: Stream, other: Stream, out: Bytes, begins: Places, wanted: int) -> bool:
+    """The same for two streams and the rows of `out` (2, ...), in place of `begins` (2,) the numbers that are written;
+    False when one cannot be read here. What limits one is the chain from code to code, and two go on at once."""
+    words, table, first = one.words, one.table, out[0]
+    words_beside, table_beside, second = other.words, other.table, out[1]
+    last, last_beside = np.uint64(one.end_bit), np.uint64(other.end_bit)
+    done, beside, end = np.uint64(begins[0]), np.uint64(begins[1]), np.uint64(wanted)
+    while done < end and beside < end:
+        for stream in (one, other):
+            if not stream.state[_IN_BLOCK] and (stream.state[_IS_LAST] or not _begin_block(stream)):
+                return False
+        at, at_beside = np.uint64(one.state[_AT]), np.uint64(other.state[_AT])
+        symbol, symbol_beside = 0, 0
+        while done < end and beside < end and symbol < _END and symbol_beside < _END:
+            if at > last or at_beside > last_beside:
+                return False
+            bits, bits_beside = _word(words, at), _word(words_beside, at_beside)
+            count = count_beside = _ONE
+            for _ in range(_LOOKS):
+                entry, entry_beside = table[bits & _INDEX_MASK], table_beside[bits_beside & _INDEX_MASK]
+                bits >>= entry & _BITS_MASK
+                bits_beside >>= entry_beside & _BITS_MASK
+                at += entry & _BITS_MASK
+                at_beside += entry_beside & _BITS_MASK
+                _write(first, done, entry)
+                _write(second, beside, entry_beside)
+                count, count_beside = entry >> _COUNT_SHIFT, entry_beside >> _COUNT_SHIFT
+                done += count
+                beside += count_beside
+                if count == _NONE or count_beside == _NONE:
+                    break
+            if count == _NONE:
+                at, done, symbol = _look_beyond(one, first, at, done)
+            if count_beside == _NONE:
+                at_beside, beside, symbol_beside = _look_beyond(other, second, at_beside, beside)
+        if symbol > _END or symbol_beside > _END:
+            return False
+        one.state[_AT], one.state[_IN_BLOCK] = np.int64(at), symbol != _END
+        other.state[_AT], other.state[_IN_BLOCK] = np.int64(at_beside), symbol_beside != _END
+    begins[0], begins[1] = inflate(one, first, int(done), wanted), inflate(other, second, int(beside), wanted)
+    return min(begins[0], begins[1]) >= wanted
+
+
+@compiled
+def _write(out: Bytes, done: np.uint64, entry: np.uint64) -> None:
+    out[done] = (entry >> np.uint64(8)) & _BYTE
+    out[done + _ONE] = (entry >> np.uint64(16)) & _BYTE
+    out[done + np.uint64(2)] = (entry >> np.uint64(24)) & _BYTE
+    out[done + np.uint64(3)] = (entry >> np.uint64(32)) & _BYTE
+
+
+@compiled
+def _look_beyond(stream: Stream, out: Bytes, at: np.uint64, done: np.uint64) -> tuple[np.uint64, np.uint64, int]:
+    """Write one literal whose code the table does not have: the next bit, the bytes written, and the symbol, greater
+    than the end's where it cannot be read here."""
+    if at > np.uint64(stream.end_bit):
+        return at, done, _CODES
+    symbol, length = _symbol_beyond(stream, _word(stream.words, at))
+    if symbol < 0:
+        return at, done, _CODES
+    if symbol < _END:
+        out[done] = symbol
+        done += _ONE
+    return at + np.uint64(length), done, symbol
+
+
+@compiled
 def ended(stream: Stream) -> bool:
     """Whether nothing but the end follows; the stream's next bit is then behind it."""
     state = stream.state
@@ -127,6 +198,22 @@ def ended(stream: Stream) -> bool:
         state[_AT] += length
         state[_IN_BLOCK] = 0
     return state[_AT] <= stream.end_bit
+
+
+@compiled
+def flushed(stream: Stream) -> bool:
+    """Whether nothing but the end of the block and an empty stored one follows, as zlib's full flush writes it; what is
+    behind that needs nothing that was before."""
+    state = stream.state
+    if state[_IN_BLOCK]:
+        symbol, length = _next_symbol(stream, state[_AT])
+        state[_AT] += length
+        if symbol != _END:
+            return False
+    if state[_IS_LAST] or _taken(stream, 3) != 0:
+        return False
+    state[_AT] = 8 * next_byte(stream)
+    return _taken(stream, 32) == _EMPTY_STORED and state[_AT] == stream.end_bit
 
 
 @compiled
@@ -301,7 +388,7 @@ def _fill_table(stream: Stream) -> None:
     table, single = stream.table, stream.single
     for index in range(_ENTRIES):
         used, count, literals = np.uint32(0), np.uint32(0), np.uint64(0)
-        for k in range(MOST_AT_ONCE):
+        for k in range(_LITERALS_OF_ENTRY):
             one = single[np.uint32(index) >> used]
             length = one & np.uint32(15)
             if length == 0 or used + length > _INDEX_BITS or one >= _LITERALS << 4:

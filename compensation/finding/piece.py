@@ -7,7 +7,8 @@ machine, and after any other piece.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
@@ -22,7 +23,8 @@ from compensation.finding.png_rows import decode_rows
 from compensation.one_camera import others_ns
 from foundation.errors import SessionError
 from foundation.instants import utc_text
-from markers.detection import Detection, DetectionError, Noise, detect, nothing_found
+from markers.detection import Detection, DetectionError, Noise, detect, follow, nothing_found, rows_to_follow
+from markers.pixels import Mask
 from markers.target import Target
 from recording.format.damage import naming
 from recording.format.images import ImageArray, decode_image
@@ -98,17 +100,22 @@ def find_markers(piece: Piece) -> FoundMarkers:
     nothing = nothing_found(piece.target)
     rows: list[tuple[int, int, tuple[int, int], Detection, str]] = []
     previous: Detection | None = None
-    size_px = (0, 0)
-    for message, image in _images(piece):
-        height, width = image.shape
-        if (width, height) != size_px:
-            previous, size_px = None, (width, height)
+    image: ImageArray | None = None
+    for frame in _frames(piece):
         detection, reason = None, ""
-        try:
-            detection = previous = detect(image, piece.target, previous, piece.noise)
-        except DetectionError as error:
-            reason = str(error)
-        rows.append((message.time_ns, message.sequence, size_px, detection or nothing, reason))
+        if previous is not None and image is not None:
+            image, detection = _followed(frame, image, piece, previous)
+        if detection is None:
+            before, image = image, frame.image(image)
+            if before is None or image.shape != before.shape:
+                previous = None
+            try:
+                detection = detect(image, piece.target, previous, piece.noise)
+            except DetectionError as error:
+                reason = str(error)
+        previous = detection or previous
+        height, width = cast(ImageArray, image).shape
+        rows.append((frame.message.time_ns, frame.message.sequence, (width, height), detection or nothing, reason))
     found = [row[3] for row in rows]
     return FoundMarkers(
         time_ns=np.array([row[0] for row in rows], np.int64),
@@ -131,27 +138,57 @@ def joined(parts: list[FoundMarkers]) -> FoundMarkers:
     return FoundMarkers(**{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names})
 
 
-def _images(piece: Piece) -> Iterator[tuple[Message, ImageArray]]:
-    """Each frame as it is recorded, and its image, which is gone when the next one is asked for."""
-    room: NDArray[np.uint8] | None = None
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A recorded frame, read and not yet decoded."""
+
+    place: FramePlace
+    message: Message
+
+    def image(self, room: ImageArray | None = None, wanted: Mask | None = None) -> ImageArray:
+        """Its pixels, in `room` where that is an image of its size, which is then gone; wanted: (height,), the rows
+        that must be right. SessionError, with the frame's time, when it cannot be read."""
+        is_room = room is not None and room.dtype == np.uint8 and room.flags.writeable
+        with _naming(self.place):
+            if self.place.schema != CompressedImage.DESCRIPTOR.full_name:
+                return decode_image(self.place.schema, self.message.data).pixels
+            try:
+                png = CompressedImage.FromString(self.message.data).data
+            except DecodeError as error:
+                raise SessionError(f"an image message cannot be read ({error})") from error
+            return decode_rows(png, cast(NDArray[np.uint8], room) if is_room else None, wanted)
+
+
+def _frames(piece: Piece) -> Iterator[_Frame]:
+    """Each frame as it is recorded."""
     for place in piece.places_of(frames_in_order(piece.segment)):
-        try:
+        with _naming(place):
             message = read_frame(place)
-            with naming(place.path):
-                image = _decoded(place.schema, message.data, room)
-        except SessionError as error:
-            raise SessionError(f"{error}; this was the frame of {utc_text(place.time_ns)}") from error
-        room = cast(NDArray[np.uint8], image) if image.dtype == np.uint8 and image.flags.writeable else None
-        yield message, image
+        yield _Frame(place, message)
 
 
-def _decoded(schema: str, data: bytes, room: NDArray[np.uint8] | None) -> ImageArray:
-    if schema != CompressedImage.DESCRIPTOR.full_name:
-        return decode_image(schema, data).pixels
+@contextmanager
+def _naming(place: FramePlace) -> Generator[None]:
+    """Errors say which frame it was."""
     try:
-        return decode_rows(CompressedImage.FromString(data).data, room)
-    except DecodeError as error:
-        raise SessionError(f"an image message cannot be read ({error})") from error
+        with naming(place.path):
+            yield
+    except SessionError as error:
+        raise SessionError(f"{error}; this was the frame of {utc_text(place.time_ns)}") from error
+
+
+def _followed(
+    frame: _Frame, before: ImageArray, piece: Piece, previous: Detection
+) -> tuple[ImageArray, Detection | None]:
+    """An image that is to be used again, and the markers found in those rows of the frame alone that it takes to go on
+    from `previous`; None where it takes all of it. `before`: the image before, which is gone."""
+    if before.dtype != np.uint8:  # of other depths only all pixels say how large one can be
+        return before, None
+    wanted = rows_to_follow(previous, piece.target, len(before))
+    image = frame.image(before, wanted)
+    if image.shape != before.shape or image.dtype != np.uint8:
+        return before, None
+    return image, follow(cast(NDArray[np.uint8], image), wanted, piece.target, previous, piece.noise)
 
 
 def frames_in_order(segment: Path) -> list[FramePlace]:

@@ -2,24 +2,39 @@
 its markers does.
 
 A few rows at a time are inflated and their filters undone (PNG specification, 9.2), while they are in the processor's
-nearest cache. Streams that are not of literals alone are inflated at once, by libdeflate. What is read, and what is
-refused, is what recording/format/images.py reads and refuses.
+nearest cache: of two strips side by side where the PNG has strips (recording/format/strips.py), and of those alone that
+are wanted. Streams that are not of literals alone are inflated at once, by libdeflate. What is read, and what is
+refused, is what recording/format/images.py reads and refuses, but for the checksum of all of a stream in strips: each
+strip has a CRC.
 """
 
 from __future__ import annotations
-
-from typing import cast
 
 import deflate
 import numpy as np
 from numpy.typing import NDArray
 
 from compensation.finding import filters, literals
-from compensation.finding.filters import undo_filters
-from compensation.finding.literals import MOST_AT_ONCE, UNFIT, Bytes, Words, ended, inflate, next_byte, opened
+from compensation.finding.filters import LEFT, undo_filters
+from compensation.finding.literals import (
+    MOST_AT_ONCE,
+    UNFIT,
+    Bytes,
+    Stream,
+    Words,
+    ended,
+    flushed,
+    inflate,
+    inflate_two,
+    next_byte,
+    opened,
+)
 from foundation.errors import SessionError
 from markers.compiled import compiled, digest, entry
-from recording.format.images import Header, ImageArray, pixel_data
+from recording.format.images import Header, ImageArray, StripPlaces, check_strip, pixel_data, strip_places
+
+Mask = NDArray[np.bool_]
+Places = NDArray[np.int64]
 
 _ROWS = 4
 _ADLER_BASE = 65521
@@ -28,21 +43,49 @@ _ADLER_BLOCK = 2048
 _TRAILER_BYTES = 4
 
 
-def decode_rows(png: bytes, room: Bytes | None = None) -> ImageArray:
+def decode_rows(png: bytes, room: Bytes | None = None, wanted: Mask | None = None) -> ImageArray:
     """The grey image (height, width), uint8 or uint16; SessionError when it is not a whole, undamaged one.
 
     room: (height, bytes of a row) of a frame that is done with, for an image of its size: fresh memory for 5 MB costs a
-    tenth of the time.
+    tenth of the time. wanted: (height,), the rows that must be right; of a PNG in strips the others may stay as they
+    were in `room`, and are then not looked at for damage.
     """
+    places = strip_places(png)
+    if places is not None:
+        pixels = _room(places.header, room)
+        if decoded_strips(png, places, wanted, pixels):
+            return _samples(pixels, places.header)
     header, compressed = pixel_data(png)
     sample_bytes = header.bit_depth // 8
-    shape = (header.height_px, header.width_px * sample_bytes)
-    pixels = room if room is not None and room.shape == shape else np.empty(shape, np.uint8)
+    pixels = _room(header, room)
     if not decoded_at_once(compressed, sample_bytes, pixels):
         _decode_in_two(header, compressed, pixels)
-    if sample_bytes == 1:
+    return _samples(pixels, header)
+
+
+def _room(header: Header, room: Bytes | None) -> Bytes:
+    shape = (header.height_px, header.width_px * header.bit_depth // 8)
+    return room if room is not None and room.shape == shape else np.empty(shape, np.uint8)
+
+
+def _samples(pixels: Bytes, header: Header) -> ImageArray:
+    if header.bit_depth == 8:
         return pixels
-    return cast(NDArray[np.uint16], pixels.view(">u2").astype(np.uint16))
+    return pixels.view(">u2").astype(np.uint16)
+
+
+def decoded_strips(png: bytes, places: StripPlaces, wanted: Mask | None, pixels: Bytes) -> bool:
+    """Whether the strips with wanted rows, or all, are of literals and where they should be; their pixels are then
+    written. SessionError when a checksum is wrong."""
+    which = np.arange(len(places.begins))
+    if wanted is not None and len(wanted) == len(pixels):
+        which = np.flatnonzero(np.logical_or.reduceat(wanted, which * places.rows))
+    begins, ends = places.begins[which], places.ends[which]
+    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
+        if not check_strip(png, begin, end):
+            return False
+    words = np.frombuffer(png, np.uint64, len(png) // 8)
+    return _decode_strips(words, 8 * begins, 8 * ends, which, places.rows, places.header.bit_depth // 8, pixels)
 
 
 def decoded_at_once(compressed: bytes, sample_bytes: int, pixels: Bytes) -> bool:
@@ -80,28 +123,35 @@ def _compiled(sources: str):
         """Inflate a zlib stream and undo the filters; where its checksum is, UNFIT for a stream or a filter that is
         not read here, and the checksum of what was inflated."""
         _ = sources
-        height, width = pixels.shape
-        stream = opened(words, 16, end_bit)
-        strip = np.empty(_ROWS * (1 + width) + MOST_AT_ONCE, np.uint8)
-        above = np.zeros(width, np.uint8)
-        low, high = 1, 0
-        beyond = 0
-        for row in range(0, height, _ROWS):
-            rows = min(_ROWS, height - row)
-            size = rows * (1 + width)
-            done = inflate(stream, strip, beyond, size)
-            if done < size:
-                return UNFIT, 0
-            low, high = _adler(strip, size, low, high)
-            if not undo_filters(strip[:size].reshape(rows, 1 + width), sample_bytes, above, pixels[row : row + rows]):
-                return UNFIT, 0
-            above = pixels[row + rows - 1]
-            beyond = done - size
-            for k in range(beyond):
-                strip[k] = strip[size + k]
-        if beyond > 0 or not ended(stream):
+        stream, sums = opened(words, 16, end_bit), np.array([1, 0])
+        if not _decode_part(stream, sample_bytes, pixels, False, sums) or not ended(stream):
             return UNFIT, 0
-        return next_byte(stream), high << 16 | low
+        return next_byte(stream), sums[1] << 16 | sums[0]
+
+    @entry
+    def decode_strips(
+        words: Words, begins: Places, ends: Places, which: Places, rows: int, sample_bytes: int, pixels: Bytes
+    ) -> bool:
+        """Inflate the strips numbered `which`, which lie between these bits, and undo their filters; False for one that
+        is not read here."""
+        _ = sources
+        height, number = len(pixels), len(which)
+        done = 0
+        while done < number:
+            first = which[done] * rows
+            stream, strip = opened(words, begins[done], ends[done]), pixels[first : first + rows]
+            two = done + 1 < number and (which[done + 1] + 1) * rows <= height
+            if two:
+                beside = which[done + 1] * rows
+                other, strip_beside = opened(words, begins[done + 1], ends[done + 1]), pixels[beside : beside + rows]
+                if not _decode_two(stream, other, sample_bytes, strip, strip_beside) or not flushed(other):
+                    return False
+            elif not _decode_part(stream, sample_bytes, strip, True, np.array([1, 0])):
+                return False
+            if not flushed(stream):
+                return False
+            done += 1 + two
+        return True
 
     @entry
     def undo(filtered: Bytes, sample_bytes: int, pixels: Bytes) -> bool:
@@ -109,7 +159,61 @@ def _compiled(sources: str):
         _ = sources
         return undo_filters(filtered, sample_bytes, np.zeros(pixels.shape[1], np.uint8), pixels)
 
-    return decode, undo
+    return decode, decode_strips, undo
+
+
+@compiled
+def _decode_part(stream: Stream, sample_bytes: int, pixels: Bytes, is_strip: bool, sums: Places) -> bool:
+    """Write the rows that a stream begins with; False when it cannot be read here. is_strip: the first row must need
+    none above. sums (2,): those of Adler-32, continued unless it is a strip."""
+    height, width = pixels.shape
+    strip = np.empty(_ROWS * (1 + width) + MOST_AT_ONCE, np.uint8)
+    above = np.zeros(width, np.uint8)
+    row, beyond = 0, 0
+    while row < height:
+        rows = 1 if is_strip and row == 0 else min(_ROWS, height - row)
+        size = rows * (1 + width)
+        done = inflate(stream, strip, beyond, size)
+        if done < size or (is_strip and row == 0 and strip[0] > LEFT):
+            return False
+        if not is_strip:
+            sums[0], sums[1] = _adler(strip, size, sums[0], sums[1])
+        if not undo_filters(strip[:size].reshape(rows, 1 + width), sample_bytes, above, pixels[row : row + rows]):
+            return False
+        row += rows
+        above = pixels[row - 1]
+        beyond = done - size
+        for k in range(beyond):
+            strip[k] = strip[size + k]
+    return beyond == 0
+
+
+@compiled
+def _decode_two(one: Stream, other: Stream, sample_bytes: int, pixels: Bytes, beside: Bytes) -> bool:
+    """The same for two strips of as many rows."""
+    height, width = pixels.shape
+    strips, begins = np.empty((2, _ROWS * (1 + width) + MOST_AT_ONCE), np.uint8), np.zeros(2, np.int64)
+    above = above_beside = np.zeros(width, np.uint8)
+    row = 0
+    while row < height:
+        rows = 1 if row == 0 else min(_ROWS, height - row)
+        size = rows * (1 + width)
+        if not inflate_two(one, other, strips, begins, size):
+            return False
+        if row == 0 and max(strips[0, 0], strips[1, 0]) > LEFT:
+            return False
+        first, second = strips[0, :size].reshape(rows, 1 + width), strips[1, :size].reshape(rows, 1 + width)
+        if not undo_filters(first, sample_bytes, above, pixels[row : row + rows]):
+            return False
+        if not undo_filters(second, sample_bytes, above_beside, beside[row : row + rows]):
+            return False
+        row += rows
+        above, above_beside = pixels[row - 1], beside[row - 1]
+        for lane in range(2):
+            begins[lane] -= size
+            for k in range(begins[lane]):
+                strips[lane, k] = strips[lane, size + k]
+    return max(begins[0], begins[1]) == 0
 
 
 @compiled
@@ -128,4 +232,4 @@ def _adler(data: Bytes, size: int, low: int, high: int) -> tuple[int, int]:
     return low, high
 
 
-_decode, _undo = _compiled(digest(filters, literals))
+_decode, _decode_strips, _undo = _compiled(digest(filters, literals))

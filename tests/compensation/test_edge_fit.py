@@ -30,7 +30,7 @@ from markers.edge_model import (
     normal_equations,
 )
 from markers.noise import Noise
-from markers.pixels import CORE, DISC, GROUND, SHARE, VALUE, Limits, Pixels, U, V, bytes_of, empty_pixels, gather
+from markers.pixels import CORE, DISC, GROUND, SHARE, VALUE, Limits, Pixels, U, V, empty_pixels, gather, picture_of
 from tests.nightly import by_night
 
 from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
@@ -69,7 +69,7 @@ def start_from(scene: Scene, offset_px: float) -> EdgeState:
 
 def fit(scene: Scene, image: np.ndarray, start: EdgeState, noise: Noise | None = None) -> EdgeFit:
     camera = Noise(scene.read_DN**2 + 1 / 12, 1 / scene.electrons_per_DN)
-    return fit_edges(image, start, noise or camera, np.tile([0.0, 2.3], (len(start.scale_px), 1)))
+    return fit_edges(picture_of(image), start, noise or camera, np.tile([0.0, 2.3], (len(start.scale_px), 1)))
 
 
 def rms_mpx(errors_px: Float) -> float:
@@ -99,7 +99,7 @@ def test_the_normal_equations_are_those_of_the_model():
     away = truth + np.array([0.02, -0.03, 0.002, 0.001, -0.002, 0.02, 0.5, 0.1, 0.1, -0.3, 0.1, -0.1])
     pixels = empty_pixels(41 * 41)
     image, limits = np.zeros((41, 41), np.uint8), Limits(0.0, 0.5, 1.5, 1.6)
-    gather(bytes_of(image), away[:2], away[2:5], 12.0, limits, 255, pixels)
+    gather(picture_of(image), away[:2], away[2:5], 12.0, limits, 255, pixels)
     values = [pixels.table[region, :, : pixels.counts[region]] for region in range(3)]
     for part in values:
         part[VALUE] = model(truth, in_image(part, pixels))
@@ -125,7 +125,7 @@ def test_pixels_are_gathered_by_where_they_lie_round_the_outline(
     shape, scale, limits = np.array([1.1, 0.08, 0.9]), 9.0, Limits(0.4, 0.7, 1.3, 1.7)
     pixels = empty_pixels(41 * 41)
     image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (41, 41), dtype)
-    gathered = gather(bytes_of(image), np.array(centre), shape, scale, limits, np.iinfo(dtype).max, pixels)
+    gathered = gather(picture_of(image), np.array(centre), shape, scale, limits, np.iinfo(dtype).max, pixels)
     v, u = np.mgrid[:41, :41]
     x, y = (u - centre[0]) / scale, (v - centre[1]) / scale
     F = np.sqrt(shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y)

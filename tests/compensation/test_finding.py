@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from compensation.finding.piece import FoundMarkers, Piece, find_markers, joined
 from compensation.finding.workers import find_to_file, in_processes, in_turn, on_cluster
 from compensation.observations import session_target
 from foundation.errors import ConfigError, SessionError
+from markers.detection import detect
 from markers.noise import Noise
 from recording.format.mcap_bytes import RECORD
 from recording.format.records import frame_places
@@ -72,6 +74,14 @@ def test_what_is_found_is_near_the_truth_and_a_dark_frame_has_its_reason(recorde
     assert not seen[dark].any()
     assert seen.mean() > 0.9
     assert np.abs((found.centres_px - recorded.true_px)[seen]).max() < 0.1
+
+
+def test_frames_decoded_in_part_give_what_whole_images_give(recorded: Recorded, pieces: list[Piece]):
+    found, previous = find_markers(pieces[0]), None
+    for number, frame in enumerate(islice(Session.open(recorded.path).frames(), 5)):
+        previous = detect(frame.image, pieces[0].target, previous, pieces[0].noise)
+        np.testing.assert_array_equal(found.centres_px[number], previous.centres_px)
+        np.testing.assert_array_equal(found.covariance_px2[number], previous.covariance_px2)
 
 
 def test_processes_find_the_same_bits(pieces: list[Piece], serial: list[FoundMarkers]):

@@ -10,6 +10,7 @@ import pytest
 from markers.edge_fit import EdgeFit, fit_edges
 from markers.light import under_common_light
 from markers.noise import Noise
+from markers.pixels import picture_of
 
 from .rendered import Float, Scene, photograph, render, shaded_light, true_centres_px
 from .test_edge_fit import rms_mpx, start_from
@@ -30,7 +31,8 @@ def scattered() -> Float:
 def fits(scene: Scene, clean: Float) -> list[EdgeFit]:
     start = start_from(scene, 0.3)
     return [
-        fit_edges(photograph(scene, clean, seed), start, CAMERA, np.tile([0.0, 1.5], (54, 1))) for seed in range(FRAMES)
+        fit_edges(picture_of(photograph(scene, clean, seed)), start, CAMERA, np.tile([0.0, 1.5], (54, 1)))
+        for seed in range(FRAMES)
     ]
 
 

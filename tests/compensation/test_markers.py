@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from foundation.errors import SessionError
-from markers.detection import Detection, DetectionError, Flag, Noise, detect, grey_image
+from markers.detection import Detection, DetectionError, Flag, Noise, detect, follow, grey_image, rows_to_follow
 from markers.detections_table import COLUMNS, DetectedImage, flags_text, write_detections
 from markers.eccentricity import disc_centres
 from markers.image_file import read_image
@@ -73,6 +73,39 @@ def test_tracking_agrees_with_a_fresh_search_far_below_the_noise():
     fresh = detect(image, PAPER, noise=CAMERA)
     tracked = detect(image, PAPER, previous=detect(photograph(HALF, half_frame(), 6), PAPER), noise=CAMERA)
     np.testing.assert_allclose(tracked.centres_px, fresh.centres_px, atol=1e-3)
+
+
+@pytest.mark.parametrize("what", ["the same scene", "a missing marker", "glare"])
+def test_a_target_is_followed_by_its_rows_alone_to_the_same_bits(what: str):
+    scene = dataclasses.replace(HALF, missing=(20,) if what == "a missing marker" else ())
+    clean = render(scene) if scene.missing else half_frame().copy()
+    first = detect(photograph(scene, clean, 1), PAPER, noise=CAMERA)
+    if what == "glare":
+        x, y = true_centres_px(HALF)[30]
+        v, u = np.indices(clean.shape)
+        clean += 400 * np.exp(-((u - x - 17) ** 2 + (v - y) ** 2) / (2 * 7.0**2))
+    image = np.asarray(photograph(scene, clean, 2), np.uint8)
+    rows = rows_to_follow(first, PAPER, len(image))
+    assert 0.3 < rows.mean() < 0.6
+    others = np.random.default_rng(1).integers(0, 256, image.shape, np.uint8)
+    followed = follow(np.where(rows[:, None], image, others), rows, PAPER, first, CAMERA)
+    assert followed is not None
+    whole = detect(image, PAPER, first, CAMERA)
+    for name in ("centres_px", "covariance_px2", "chi", "flags", "homography"):
+        np.testing.assert_array_equal(getattr(followed, name), getattr(whole, name))
+
+
+def test_a_target_that_takes_more_rows_is_not_followed():
+    first = half_tracked()
+    image = np.asarray(photograph(HALF, half_frame(), 2), np.uint8)
+    rows = rows_to_follow(first, PAPER, len(image))
+    assert follow(image, rows, PAPER, first, CAMERA) is not None
+    for row in np.flatnonzero(np.diff(rows.astype(int)) > 0) + 6:  # the first rows of the bands
+        without = rows.copy()
+        without[row] = False
+        assert follow(image, without, PAPER, first, CAMERA) is None
+    moved = dataclasses.replace(HALF, shift_mm=(0.0, 6.0))
+    assert follow(np.asarray(photograph(moved, render(moved), 2), np.uint8), rows, PAPER, first, CAMERA) is None
 
 
 def test_a_turned_target_keeps_its_numbers_when_tracked_past_a_quarter_turn():

@@ -10,7 +10,8 @@ import pytest
 from compensation.finding import png_rows
 from compensation.finding.png_rows import decode_rows
 from foundation.errors import SessionError
-from recording.format.images import decode_png, encode_png
+from recording.format.images import check_strip, decode_png, encode_png, strip_places
+from tests.recording.test_strips import with_index
 
 FILTERS = {
     "none": cv2.IMWRITE_PNG_FILTER_NONE,
@@ -137,3 +138,83 @@ def test_memory_of_a_frame_that_is_done_with_is_used_again():
     assert decode_rows(encode_png(other), first) is first
     assert np.array_equal(first, other)
     assert decode_rows(encode_png(image("uint8", (5, 7))), first) is not first
+
+
+STRIPED = image("uint8", (110, 83))
+ROWS = 33
+"""Of a strip of so narrow an image: there are four."""
+
+
+def wanted(*rows: int) -> np.ndarray:
+    chosen = np.zeros(len(STRIPED), bool)
+    chosen[list(rows)] = True
+    return chosen
+
+
+@pytest.mark.parametrize("dtype", GREATEST)
+@pytest.mark.parametrize("rows", [(0,), (50, 51), (109,), (32, 33, 98), ()])
+def test_only_the_strips_of_wanted_rows_are_decoded(rows: tuple[int, ...], dtype: str, monkeypatch: pytest.MonkeyPatch):
+    only_literals(monkeypatch)
+    pixels = image(dtype, STRIPED.shape)
+    strips = {row // ROWS for row in rows}
+    room = np.full((110, 83 * pixels.itemsize), 7, np.uint8)
+    decode_rows(encode_png(pixels), room, wanted(*rows))
+    expected = pixels.astype(pixels.dtype.newbyteorder(">")).view(np.uint8)
+    for strip in range(4):
+        found = room[strip * ROWS : (strip + 1) * ROWS]
+        assert np.array_equal(found, expected[strip * ROWS : (strip + 1) * ROWS] if strip in strips else 7 + 0 * found)
+
+
+def strip_of(png: bytes, number: int) -> tuple[int, int]:
+    places = strip_places(png)
+    assert places is not None
+    assert places.rows == ROWS
+    return int(places.begins[number]), int(places.ends[number])
+
+
+def test_a_damaged_strip_is_reported_where_it_is_wanted():
+    png = encode_png(STRIPED)
+    begin, end = strip_of(png, 1)
+    damaged = png[: begin + 20] + bytes([png[begin + 20] ^ 4]) + png[begin + 21 :]
+    assert np.array_equal(decode_rows(damaged, None, wanted(10, 70))[:ROWS], STRIPED[:ROWS])
+    for rows in (wanted(40), None):
+        with pytest.raises(SessionError, match="a checksum is wrong"):
+            decode_rows(damaged, None, rows)
+    assert check_strip(png, begin, end)
+    assert not check_strip(png, begin, end - 1)
+
+
+def test_a_strip_that_is_not_one_is_read_as_all_of_the_image():
+    """A first row that needs the one above, a stream that goes on in the next strip, codes of another kind: right
+    pixels or an error, whatever the index says."""
+    rows = b"".join(b"\2" + bytes(row) for row in np.diff(STRIPED, axis=0, prepend=np.uint8(0)))
+    compressors = [zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy) for strategy in (2, 0)]
+    for compressor, flush in zip(compressors, (zlib.Z_FULL_FLUSH, zlib.Z_SYNC_FLUSH), strict=True):
+        parts = [compressor.compress(rows[first : first + ROWS * 84]) + compressor.flush(flush) for first in cuts()]
+        ends = b"\x03\0" + struct.pack(">I", zlib.adler32(rows))
+        chunks = [b"IDAT" + body for body in (b"\x78\x01", *parts, ends)]
+        index = b"roWS" + struct.pack(">6I", ROWS, 4, *map(len, parts))
+        png = encode_png(STRIPED)[:33] + b"".join(
+            struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+            for chunk in (index, *chunks, b"IEND")
+        )
+        assert strip_places(png) is not None
+        assert np.array_equal(decode_rows(png, None, wanted(40)), STRIPED)
+
+
+def cuts() -> range:
+    return range(0, 110 * 84, ROWS * 84)
+
+
+def test_an_index_that_is_wrong_never_makes_wrong_pixels():
+    png = encode_png(STRIPED)
+    begin = png.index(b"roWS") + 4
+    right = png[begin : begin + 24]
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        index = bytearray(right)
+        for place in rng.integers(0, 24, rng.integers(1, 4)):
+            index[place] = rng.integers(0, 256)
+        other = with_index(png, bytes(index[: rng.integers(20, 25)]))
+        assert np.array_equal(decode_rows(other), STRIPED)
+        assert np.array_equal(decode_rows(other, None, wanted(70))[66:99], STRIPED[66:99])

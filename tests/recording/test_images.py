@@ -176,7 +176,7 @@ def header(width=14, height=9, *rest):
 
 
 END = (b"IEND", b"")
-PIXELS = (b"IDAT", dict(chunks(encode_png(SMALL)))[b"IDAT"])
+PIXELS = (b"IDAT", b"".join(body for kind, body in chunks(encode_png(SMALL)) if kind == b"IDAT"))
 ROWS = zlib.decompress(PIXELS[1])
 
 
