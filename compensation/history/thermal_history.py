@@ -7,6 +7,7 @@ linear between readings, the supply holds until the next reading or power step.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,17 +134,29 @@ def _powered(session: Session) -> tuple[TimesNs, Float]:
 
 
 def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: Float) -> States:
-    """The thermal states at instants (F,), ascending, ns, at which the camera had these temperatures (F,)."""
-    unknown = States.at_degC(camera_degC, len(time_ns), memory)
-    if not history.has_ambient or len(time_ns) == 0 or time_ns[-1] <= history.ambient_ns[0]:
-        return unknown
-    begin_ns = int(history.ambient_ns[0])
-    marks_ns = np.unique(np.concatenate([np.arange(begin_ns, int(time_ns[-1]) + 1, _STEP_NS), time_ns]))
-    marks_ns = marks_ns[marks_ns >= begin_ns]
-    camera = _camera(history, marks_ns, time_ns, camera_degC)
-    inputs = np.column_stack([np.diff(marks_ns) / NS_PER_S, *_means(history, marks_ns), camera[1:]])
-    found = _followed(memory, inputs, np.minimum(np.searchsorted(marks_ns, time_ns), len(inputs)))
-    return States.from_rows(memory, np.where(np.isfinite(found[:, :1]), found, unknown.rows))
+    """The thermal states at instants (F,), ascending, ns, at which the camera had these temperatures (F,).
+
+    Those that were asked for last are kept, since a fit and its report ask for the same several times: not to be
+    written to.
+    """
+    times_ns, degC = np.asarray(time_ns, np.int64), np.asarray(camera_degC, np.float64)
+    return States.from_rows(memory, _rows_at(history, memory, times_ns.tobytes(), degC.tobytes()))
+
+
+@lru_cache(maxsize=8)
+def _rows_at(history: History, memory: Memory, times: bytes, temperatures: bytes) -> Float:
+    time_ns, camera_degC = np.frombuffer(times, np.int64), np.frombuffer(temperatures, np.float64)
+    rows = States.at_degC(camera_degC, len(time_ns), memory).rows
+    if history.has_ambient and len(time_ns) and time_ns[-1] > history.ambient_ns[0]:
+        begin_ns = int(history.ambient_ns[0])
+        marks_ns = np.unique(np.concatenate([np.arange(begin_ns, int(time_ns[-1]) + 1, _STEP_NS), time_ns]))
+        marks_ns = marks_ns[marks_ns >= begin_ns]
+        camera = _camera(history, marks_ns, time_ns, camera_degC)
+        inputs = np.column_stack([np.diff(marks_ns) / NS_PER_S, *_means(history, marks_ns), camera[1:]])
+        found = _followed(memory, inputs, np.minimum(np.searchsorted(marks_ns, time_ns), len(inputs)))
+        rows = np.where(np.isfinite(found[:, :1]), found, rows)
+    rows.flags.writeable = False
+    return rows
 
 
 def _followed(memory: Memory, inputs: Float, after: NDArray[np.intp]) -> Float:

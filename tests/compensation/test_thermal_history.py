@@ -50,6 +50,18 @@ def test_a_lag_follows_a_step_as_the_exponential_does(after_s: int):
     assert found.rate_K_per_h[0] == pytest.approx(6 * 10 * np.exp(-after_s / 600), abs=0.2)
 
 
+def test_states_that_are_asked_for_again_are_kept_and_those_of_anything_else_are_not():
+    record = history()
+    first = at(record, 1800, 5400)
+    with pytest.raises(ValueError, match="read-only"):
+        first.camera_degC[0] = 0.0
+    assert np.shares_memory(first.play_degC, at(record, 1800, 5400).play_degC)
+    assert at(record, 1800, 5400, camera_degC=60.0).play_degC[1, 0] == pytest.approx(58.0)  # 2 K behind
+    assert at(record, 1800, 7200).ambient_lag_degC[1, 0] > first.ambient_lag_degC[1, 0] + 0.1
+    warmer = replace(record, ambient_degC=record.ambient_degC + 1)
+    assert at(warmer, 1800, 5400).ambient_lag_degC[0, 0] == pytest.approx(25.0)
+
+
 def test_a_part_between_air_and_camera_has_plays_of_its_own():
     """Switched on, the chip is 20 K warmer and the part 0.3 of that; its play is left 2 K behind, and behind 54 degC of
     the air when all has settled there."""
