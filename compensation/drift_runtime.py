@@ -107,8 +107,9 @@ class ThermalState:
         self._power = _followed(self._power, power_on, self._gained)
         self._camera = _followed(self._camera, (before_degC + self.camera_degC) / 2, self._gained)
         self._plays = [
-            min(max(play, push_degC - radius_K), push_degC + radius_K)
+            low if play < low else high if play > high else play
             for play, push_degC, radius_K in zip(self._plays, self._pushes(), self._radii_K, strict=True)
+            for low, high in ((push_degC - radius_K, push_degC + radius_K),)
         ]
         if self._unseen and not math.isnan(camera_degC):
             self._unseen = False
