@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import typer
 
+from foundation.json_values import plain
 from foundation.usage import one_line
 
 
@@ -47,7 +46,7 @@ def show(data: object, lines: Iterable[object]) -> None:
     """The result of a command: `data` (values of JSON, dataclasses, arrays; what else there is as text; NaN and
     infinities as null), or the lines."""
     if output().as_json:
-        typer.echo(json.dumps(_plain(data), indent=2, default=str))
+        typer.echo(json.dumps(plain(data), indent=2, default=str))
         return
     for line in lines:
         typer.echo(line)
@@ -55,22 +54,10 @@ def show(data: object, lines: Iterable[object]) -> None:
 
 def json_line(data: object) -> str:
     """Of what goes on, for programs: as `show` has it, in one line."""
-    return json.dumps(_plain(data), default=str)
+    return json.dumps(plain(data), default=str)
 
 
 def say(line: object) -> None:
     """What goes on, in one line on standard error; nothing when quiet."""
     if not output().quiet:
         typer.echo(one_line(line), err=True)
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from foundation.errors import SessionError
 from foundation.files import replace_file, sync_folder
+from foundation.json_values import json_object
 from foundation.lock_file import try_lock
 from recording.format.inventory import State, inventory
 from recording.reading.catalogue import DELETED, Entry, contents_of
@@ -152,12 +153,11 @@ def _is_copy(copy: Path, contents: str) -> bool:
     return copy.is_dir() and _manifest(copy).get("contents") == contents == contents_of(copy)
 
 
-def _manifest(copy: Path) -> dict[str, Any]:
+def _manifest(copy: Path) -> dict[str, object]:
     try:
-        found: object = json.loads((copy / MANIFEST).read_bytes())
-    except (OSError, ValueError, RecursionError):
+        return json_object((copy / MANIFEST).read_bytes()) or {}
+    except OSError:
         return {}
-    return cast("dict[str, Any]", found) if isinstance(found, dict) else {}
 
 
 def _clear(part: Path, wanted: set[str]) -> None:

@@ -185,16 +185,8 @@ def _reading(
 
 def encode_frame_meta(frame: Frame) -> bytes:
     """What belongs to a frame, without its image."""
-    return _FrameMeta(
-        channel=frame.channel,
-        step_id=frame.step_id,
-        block_id=frame.block_id,
-        camera_ticks=frame.camera_ticks,
-        exposure_s=frame.exposure_s,
-        gain_dB=frame.gain_dB,
-        camera_degC=canonical(frame.camera_degC),
-        dropped=frame.dropped,
-    ).SerializeToString()
+    fields = {name: getattr(frame, name) for name in FrameMeta.__dataclass_fields__}
+    return _FrameMeta(**{**fields, "camera_degC": canonical(frame.camera_degC)}).SerializeToString()
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import cast
 
+from foundation.json_values import json_object
 from recording.format.utc_offsets import UtcOffsets
 from recording.reading.run_word import Run, known_word
 
@@ -33,13 +33,9 @@ class Extent:
 
 def extent_of(session: Mapping[str, str]) -> Extent | None:
     """By a session's record; None for what is no part, or where it is not understood."""
-    try:
-        found: object = json.loads(session.get("extent", "") or "null")
-    except (ValueError, RecursionError):
+    fields = json_object(session.get("extent", ""))
+    if fields is None:
         return None
-    if not isinstance(found, dict):
-        return None
-    fields = cast("dict[str, object]", found)
     begin_ns, end_ns = fields.get("begin_ns"), fields.get("end_ns")
     if not isinstance(begin_ns, int) or not isinstance(end_ns, int):
         return None

@@ -6,11 +6,11 @@ line was never acknowledged.
 
 from __future__ import annotations
 
-import json
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+
+from foundation.json_values import json_object
 
 JOURNAL_NAME = "journal.jsonl"
 LIMIT_BYTES = 32_000_000  # an entry a minute for 200 days; all of them are in memory
@@ -83,9 +83,11 @@ def journal_facts(directory: Path) -> JournalFacts | None:
         lines = lines_of(path.read_bytes())
     except OSError as error:
         return JournalFacts(damage=f"cannot be read ({error.strerror})")
-    last = next((entry for text in reversed(lines.sound) if (entry := _fields(text)) is not None), dict[str, object]())
+    last = next(
+        (entry for text in reversed(lines.sound) if (entry := json_object(text)) is not None), dict[str, object]()
+    )
     few = (text for text in lines.sound if b'"done"' in text or b'"Gap"' in text)  # the others take seconds to decode
-    entries = [entry for text in few if (entry := _fields(text)) is not None]
+    entries = [entry for text in few if (entry := json_object(text)) is not None]
     is_end = last.get("entry") == "Ended"
     done = (entry.get("step_id") for entry in entries if entry.get("entry") == "Step" and entry.get("state") == "done")
     last_ns = _instant(last.get("time_ns"))
@@ -97,15 +99,6 @@ def journal_facts(directory: Path) -> JournalFacts | None:
         frozenset(step_id for step_id in done if isinstance(step_id, str)),
         damage_text(lines) if lines.damaged else "",
     )
-
-
-def _fields(text: bytes) -> dict[str, object] | None:
-    """A line's fields; None when it is no JSON object."""
-    try:
-        found: object = json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-    return cast("dict[str, object]", found) if isinstance(found, dict) else None
 
 
 def _instant(value: object) -> int:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import cast
 
 from foundation.errors import ConfigError, SessionError
+from foundation.json_values import json_object
 from recording.reading.journal_lines import journal_line, lines_of
 
 NOTES_NAME = "notes.jsonl"
@@ -70,7 +71,7 @@ def read_notes(directory: Path) -> Notes:
     finally:
         os.close(fd)
     found = lines_of(data).sound
-    return _folded(entry for line in found if (entry := _entry(line)) is not None)
+    return _folded(entry for line in found if (entry := json_object(line)) is not None)
 
 
 def add_note(directory: Path, text: str, by: str, time_ns: int) -> None:
@@ -120,14 +121,6 @@ def _append(directory: Path, fields: Mapping[str, object]) -> None:
             os.close(fd)
     except OSError as error:
         raise SessionError(f"{path}: the note could not be kept ({error.strerror})") from error
-
-
-def _entry(line: bytes) -> dict[str, object] | None:
-    try:
-        found: object = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return cast("dict[str, object]", found) if isinstance(found, dict) else None
 
 
 def _folded(entries: Iterable[dict[str, object]]) -> Notes:

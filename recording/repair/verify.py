@@ -40,6 +40,7 @@ from recording.reading.kept_originals import is_recovered
 from recording.reading.run_word import Files, Run, run_word
 from recording.reading.temperature_present import NO_TEMPERATURE, has_temperature
 from recording.repair.segment_check import Damage, SegmentCheck, check_segment
+from recording.repair.share_done import no_report
 from recording.writing.recorder_settings import SessionInfo
 
 
@@ -145,11 +146,7 @@ def _extent(extent: Extent | None, utc: UtcOffsets) -> Iterator[Finding]:
         yield _note(extent.text(utc))
 
 
-def _no_report(done_bytes: float, text: str) -> None:
-    """No progress is shown."""
-
-
-def verify(path: Path, report: Callable[[float, str], None] = _no_report) -> Verification:
+def verify(path: Path, report: Callable[[float, str], None] = no_report) -> Verification:
     """Read the whole session in `path`; `report` gets the bytes read so far and the segment.
 
     SessionError when `path` is no session. Damage is not raised, it is found.

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,10 +161,11 @@ class Recorder:
     async def run(self) -> None:
         """Record until cancelled."""
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._report_on_ticks())  # by itself: it has to report a disk that holds up the others
-            tasks.create_task(self._save_telemetry_on_ticks())
+            # By itself: it has to report a disk that holds up the others.
+            tasks.create_task(self._on_ticks(self._report_on_tick))
+            tasks.create_task(self._on_ticks(self._save_telemetry))
             tasks.create_task(self._frames.record())
-            tasks.create_task(self._tend_frames_on_ticks())
+            tasks.create_task(self._on_ticks(self._frames.tend))
             tasks.create_task(self._refound_when_asked())
 
     async def flushed(self) -> None:
@@ -231,29 +232,20 @@ class Recorder:
         """A frame's description without its image, as the copy of a session that lost that image has it."""
         self._telemetry.keep(description)
 
-    async def _save_telemetry_on_ticks(self) -> None:
+    async def _on_ticks(self, work: Callable[[int], Awaitable[None]]) -> None:
+        """At each instant at which the telemetry is committed."""
         due_ns = self._clock.now_ns()
         while True:
-            due_ns = await self._next_tick(due_ns)
-            await self._telemetry.save()
-            self._report()  # a disk that is nearly full: frames are lost until this is reported
+            due_ns += seconds_ns(self._settings.telemetry_commit_s)
+            await self._clock.sleep_until(due_ns)
+            await work(due_ns)
 
-    async def _tend_frames_on_ticks(self) -> None:
-        due_ns = self._clock.now_ns()
-        while True:
-            due_ns = await self._next_tick(due_ns)
-            await self._frames.tend(due_ns)
+    async def _save_telemetry(self, _: int) -> None:
+        await self._telemetry.save()
+        self._report()  # a disk that is nearly full: frames are lost until this is reported
 
-    async def _report_on_ticks(self) -> None:
-        due_ns = self._clock.now_ns()
-        while True:
-            due_ns = await self._next_tick(due_ns)
-            self._report()
-
-    async def _next_tick(self, last_ns: int) -> int:
-        due_ns = last_ns + seconds_ns(self._settings.telemetry_commit_s)
-        await self._clock.sleep_until(due_ns)
-        return due_ns
+    async def _report_on_tick(self, _: int) -> None:
+        self._report()
 
     async def _refound_when_asked(self) -> None:
         """After `refound`: the folders are found or made again, and the loss is an event."""
