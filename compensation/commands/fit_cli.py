@@ -20,6 +20,7 @@ from compensation.drift.paper_model import MAX_DEGREE
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.unrepeated import Cause, find_unrepeated
 from compensation.observations import Observations
+from compensation.reporting.drawing.drawing import drawing
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
 from compensation.reporting.report import (
@@ -166,12 +167,13 @@ def report(
             _extras(sessions, camera, budget, finding.target, validation, details),
         )
         observations = finding.observed(sessions, camera)
-        if given is None:
-            used, evaluation, refusal = fitted(observations)
-        else:
-            used, refusal = given, ""
-            evaluation = evaluate(given, observations) if can_be_scored(observations) else None
-        write_report(out, observations, used, evaluation, extras)
+        with drawing(finding.workers) as draw:
+            if given is None:
+                used, evaluation, refusal = fitted(observations)
+            else:
+                used, refusal = given, ""
+                evaluation = evaluate(given, observations) if can_be_scored(observations) else None
+            write_report(out, observations, used, evaluation, extras, draw)
         if refusal:
             raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
         alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"

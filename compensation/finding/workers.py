@@ -45,9 +45,9 @@ def in_processes(workers: int) -> Work:
         left, tries = set(range(len(pieces))), 0
         while left:
             before = len(left)
-            with TemporaryDirectory(prefix="thermostand-found-") as folder, _pool(workers) as pool:
+            with TemporaryDirectory(prefix="thermostand-found-") as folder, pool(workers) as processes:
                 try:
-                    for index, found in _finished(pool, folder, pieces, sorted(left)):
+                    for index, found in _finished(processes, folder, pieces, sorted(left)):
                         left.discard(index)
                         yield index, found
                 except BrokenProcessPool as error:
@@ -62,10 +62,12 @@ def in_processes(workers: int) -> Work:
 
 
 def _finished(
-    pool: ProcessPoolExecutor, folder: str, pieces: Sequence[Piece], indices: Iterable[int]
+    processes: ProcessPoolExecutor, folder: str, pieces: Sequence[Piece], indices: Iterable[int]
 ) -> Iterator[tuple[int, FoundMarkers]]:
     """As they are finished, also those that were when the pool broke."""
-    waiting: dict[Future[str], int] = {pool.submit(find_to_file, pieces[index], folder): index for index in indices}
+    waiting: dict[Future[str], int] = {
+        processes.submit(find_to_file, pieces[index], folder): index for index in indices
+    }
     broken: BrokenProcessPool | None = None
     while waiting:
         done, _ = wait(waiting, return_when=FIRST_COMPLETED)
@@ -93,15 +95,15 @@ def find_to_file(piece: Piece, folder: str) -> str:
 
 
 @contextmanager
-def _pool(workers: int) -> Generator[ProcessPoolExecutor]:
+def pool(workers: int) -> Generator[ProcessPoolExecutor]:
     """Forked from a process of their own kind that has loaded what they need, once for all pools (a fork of this one
     would copy its threads' locks); what is not begun is dropped on any early way out."""
     context = multiprocessing.get_context("forkserver")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
+    processes = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     try:
-        yield pool
+        yield processes
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        processes.shutdown(wait=True, cancel_futures=True)
 
 
 def _begin() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from compensation.calibration.calibrate import Calibration
 from compensation.calibration.camera_file import CameraFile
 from compensation.reporting.drawing import calibration_figures as figures
-from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Table, page
 
 _FIGURES = (
@@ -38,7 +37,7 @@ _FIGURES = (
 
 def report_page(file: CameraFile, calibration: Calibration) -> str:
     """The report as HTML text; the same data give the same text."""
-    drawn = [Drawing(as_svg(draw(calibration), name), caption) for draw, name, caption in _FIGURES]
+    drawn = [Drawing(draw(calibration), name, caption) for draw, name, caption in _FIGURES]
     title = f"Calibration of camera {file.camera_serial}"
     parts = [
         Heading(title, 1),

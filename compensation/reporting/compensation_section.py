@@ -10,7 +10,6 @@ from compensation.drift.candidates import Candidate
 from compensation.drift.evaluation import Evaluation
 from compensation.observations import Observations
 from compensation.reporting.drawing import fit_figures as figures
-from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.drawing.path_figures import EXAGGERATION
 from compensation.reporting.numbers import (
     FormulaNumbers,
@@ -38,11 +37,13 @@ def compensation_section(observations: Observations, evaluation: Evaluation, sco
     method = score.method
     yield Heading("Before and after compensation")
     yield Drawing(
-        as_svg(figures.compensated_paths(observations, evaluation), "compensated"),
+        figures.compensated_paths(observations, evaluation),
+        "compensated",
         f"Drift of each marker, enlarged {EXAGGERATION} times, before and after compensation; {method}.",
     )
     yield Drawing(
-        as_svg(figures.residual_map(observations, evaluation), "residual-map"),
+        figures.residual_map(observations, evaluation),
+        "residual-map",
         "What the model leaves at each marker, measured − model, mean over the frames of each set-point, at a scale of "
         f"its own; arrows that agree over the image are errors of the model, not noise; {method}.",
     )
@@ -65,7 +66,7 @@ def compensation_section(observations: Observations, evaluation: Evaluation, sco
         ("temperature", figures.against_temperature, "RMS deviation at each chamber temperature"),
     )
     for name, draw, caption in of_evaluation:
-        yield Drawing(as_svg(draw(evaluation), name), f"{caption}; {method}.")
+        yield Drawing(draw(evaluation), name, f"{caption}; {method}.")
     yield Table(
         ("chamber, °C", "camera, °C", "frames", "I before, px", "I after, mpx", "J before, px", "J after, mpx"),
         [

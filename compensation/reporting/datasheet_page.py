@@ -12,7 +12,6 @@ from itertools import groupby
 from compensation.datasheet.datasheet import Datasheet
 from compensation.datasheet.quantity import COVERAGE, Quantity
 from compensation.reporting.drawing import datasheet_figures as figures
-from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.equipment import Line, stated
 from compensation.reporting.numbers import measured, percent, significant, typeset
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
@@ -136,14 +135,16 @@ def _unknown(quantities: Sequence[Quantity]) -> Iterator[Part]:
 
 def _figures(sheet: Datasheet) -> Iterator[Part]:
     yield Drawing(
-        as_svg(figures.over_temperature(sheet), "temperature"),
+        figures.over_temperature(sheet),
+        "temperature",
         "The image's motion from the reference at each visit of a set-point, reached by heating (full) and by cooling "
         "(open). Dashed: the stated coefficient.",
     )
     warming = sheet.warming
     if warming is not None:
         yield Drawing(
-            as_svg(figures.warm_up(warming, sheet.by_key["settling_s"].value), "warm-up"),
+            figures.warm_up(warming, sheet.by_key["settling_s"].value),
+            "warm-up",
             "Switching on: shift of the image's middle and temperatures in the first warm-up.",
         )
 

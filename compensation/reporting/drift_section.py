@@ -9,7 +9,6 @@ import numpy as np
 
 from compensation.observations import Observations
 from compensation.reporting.drawing import drift_figures as figures
-from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.drawing.path_figures import EXAGGERATION, Paths, trajectories
 from compensation.reporting.numbers import HysteresisNumbers, Numbers, percent
 from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
@@ -29,7 +28,7 @@ def drift_section(observations: Observations, numbers: Numbers) -> Iterator[Part
     yield from _warm_ups(observations, numbers)
     yield Heading("Drift over temperature" if numbers.hysteresis_before else "Drift over time")
     yield from _cycles(observations, numbers)
-    yield Drawing(as_svg(figures.against_time(observations), "time"), _time_caption(observations))
+    yield Drawing(figures.against_time(observations), "time", _time_caption(observations))
 
 
 def _time_caption(observations: Observations) -> str:
@@ -59,12 +58,14 @@ def _warm_ups(observations: Observations, numbers: Numbers) -> Iterator[Part]:
     shown = found[:_MOST_PANELS]
     titles = _titles(shown)
     yield Drawing(
-        as_svg(figures.warm_up_curves(observations, shown, titles), "warm-up-curves"),
+        figures.warm_up_curves(observations, shown, titles),
+        "warm-up-curves",
         "Mean drift of the markers since the first frame while the camera warms itself, and its own temperature.",
     )
     panels = [_panel(observations, one.track, title) for one, title in zip(shown, titles, strict=True)]
     yield Drawing(
-        as_svg(trajectories(observations, panels), "warm-up-paths"),
+        trajectories(observations, panels),
+        "warm-up-paths",
         f"Drift of each marker from its first place (grey disc), enlarged {EXAGGERATION} times. Colour is the camera's "
         "own temperature.",
     )
@@ -132,14 +133,16 @@ def _cycles(observations: Observations, numbers: Numbers) -> Iterator[Part]:
             continue
         of_session = f" Session {facts.session_id}." if several else ""
         yield Drawing(
-            as_svg(trajectories(observations, [_panel(observations, track, "")]), f"cycle-{index}"),
+            trajectories(observations, [_panel(observations, track, "")]),
+            f"cycle-{index}",
             f"Drift of each marker over the thermal cycle, enlarged {EXAGGERATION} times from its place at the "
             f"reference temperature (grey disc). Colour is the camera's own temperature.{of_session}",
         )
         own = visits(observations, track)
         name = facts.session_id
         yield Drawing(
-            as_svg(figures.branches(own, before[name], after.get(name, ())), f"branches-{index}"),
+            figures.branches(own, before[name], after.get(name, ())),
+            f"branches-{index}",
             "Above: mean drift at each set-point, reached by heating (filled) or by cooling (open). Below: what the "
             f"way there makes of it, with twice its standard uncertainty.{of_session}",
         )

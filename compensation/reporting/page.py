@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from functools import cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from matplotlib.figure import Figure
+
+from compensation.reporting.drawing.drawing import Draw, one_by_one
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +57,21 @@ class Listing:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """An SVG element with its caption."""
+    """A figure with its caption; `name` begins its ids, so that several fit in one page."""
 
-    svg: str
+    figure: Figure
+    name: str
     caption: str
 
 
 Part = Heading | Paragraph | Listing | Table | Facts | Drawing
 
 
-def page(title: str, parts: Sequence[Part]) -> str:
+def page(title: str, parts: Sequence[Part], draw: Draw = one_by_one) -> str:
     """A whole HTML page."""
-    return _template().render(title=title, parts=[(type(part).__name__, part) for part in parts])
+    svg = iter(draw([(part.figure, part.name) for part in parts if isinstance(part, Drawing)]))
+    named = [(type(part).__name__, part, next(svg) if isinstance(part, Drawing) else "") for part in parts]
+    return _template().render(title=title, parts=named)
 
 
 @cache

@@ -17,7 +17,7 @@ from compensation.drift.model_file import save_model
 from compensation.observations import Observations, Progress, observe
 from compensation.reporting.compensation_section import compensation_section, model_section, uncertainty_section
 from compensation.reporting.data_section import data_section, utc
-from compensation.reporting.drawing.figures import as_svg
+from compensation.reporting.drawing.drawing import Draw, one_by_one
 from compensation.reporting.drift_section import drift_section
 from compensation.reporting.equipment import equipment_of
 from compensation.reporting.extras import Extras
@@ -109,12 +109,13 @@ def write_report(
     model: DriftModel | None = None,
     evaluation: Evaluation | None = None,
     extras: Extras | None = None,
+    draw: Draw = one_by_one,
 ) -> None:
-    """Write page and numbers, each whole or not at all; without a model the drift alone. SessionError when the place
-    refuses."""
+    """Write page and numbers, each whole or not at all; without a model the drift alone. draw: how the figures are
+    drawn. SessionError when the place refuses."""
     extras, path = extras or Extras(), Path(path)
     numbers = numbers_of(observations, model, evaluation, extras)
-    text = _page(observations, evaluation, numbers, extras)
+    text = _page(observations, evaluation, numbers, extras, draw)
     write_whole(path, text)
     write_whole(numbers_path(path), as_json(numbers))
 
@@ -127,10 +128,12 @@ def report_page(
 ) -> str:
     """The report as HTML text; the same data give the same text."""
     extras = extras or Extras()
-    return _page(observations, evaluation, numbers_of(observations, model, evaluation, extras), extras)
+    return _page(observations, evaluation, numbers_of(observations, model, evaluation, extras), extras, one_by_one)
 
 
-def _page(observations: Observations, evaluation: Evaluation | None, numbers: Numbers, extras: Extras) -> str:
+def _page(
+    observations: Observations, evaluation: Evaluation | None, numbers: Numbers, extras: Extras, draw: Draw
+) -> str:
     subject = "Thermal drift" if numbers.model is None else "Thermal compensation"
     title = f"{subject} of camera {numbers.camera}"
     parts = [Heading(title, 1), Paragraph(_lead(numbers), aside=True), *result_section(numbers, extras.validation)]
@@ -139,7 +142,7 @@ def _page(observations: Observations, evaluation: Evaluation | None, numbers: Nu
     parts += space_section(extras.positions, observations.target, extras.validation)
     parts += stand_section(numbers)
     parts += data_section(numbers)
-    return page(title, parts)
+    return page(title, parts, draw)
 
 
 def _compensation(observations: Observations, evaluation: Evaluation | None, numbers: Numbers) -> Iterator[Part]:
@@ -165,7 +168,8 @@ def space_section(positions: TablePositions, target: Target, validation: Validat
     yield Heading("In three dimensions")
     if positions.calibration or positions.poses:
         yield Drawing(
-            as_svg(positions_figure(positions, target), "table"),
+            positions_figure(positions, target),
+            "table",
             "Where the table held the target, seen from above; the camera looks from the left.",
         )
     if validation is not None:

@@ -11,7 +11,6 @@ from compensation.drift.drift_model import Outside
 from compensation.drift.evaluation import improvement_percent
 from compensation.observations import Float
 from compensation.reporting.drawing import validation_figures as figures
-from compensation.reporting.drawing.figures import as_svg
 from compensation.reporting.numbers import percent
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
@@ -37,7 +36,8 @@ def validation_parts(validation: Validation, level: int = 2) -> list[Part]:
         Paragraph(_method(validation)),
         Heading("Deviations by temperature", level),
         Drawing(
-            as_svg(figures.bars(validation), "bars"),
+            figures.bars(validation),
+            "bars",
             "Mean absolute deviation of the positions at each temperature but the reference, before (blue) and after "
             "(orange) compensation, in the form of the paper's figure 15; dashed are the paper's means.",
         ),
@@ -100,8 +100,8 @@ def _method(validation: Validation) -> str:
 
 def _by_position(validation: Validation) -> Iterator[Part]:
     for number, one in enumerate(variant for variant in (validation.after, validation.with_stand) if variant):
-        drawn = as_svg(figures.by_position(validation, one), f"positions-{number}")
-        yield Drawing(drawn, f"Deviations {one.name}; lines are standard uncertainties.")
+        drawn = figures.by_position(validation, one)
+        yield Drawing(drawn, f"positions-{number}", f"Deviations {one.name}; lines are standard uncertainties.")
 
 
 def _rows(validation: Validation) -> Iterator[list[str]]:

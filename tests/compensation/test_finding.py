@@ -110,10 +110,10 @@ def test_what_a_process_answers_fits_into_one_write_of_a_pipe(
 
 OWNER = """if True:
     import os, time
-    from compensation.finding.workers import _pool
+    from compensation.finding.workers import pool
     if __name__ == "__main__":
-        with _pool(1) as pool:
-            print(pool.submit(os.getpid).result(), flush=True)
+        with pool(1) as processes:
+            print(processes.submit(os.getpid).result(), flush=True)
             time.sleep(60)
 """
 

@@ -1,0 +1,22 @@
+"""Figures drawn by two processes are those drawn by one, also when the other process is killed."""
+
+import multiprocessing
+
+from compensation.reporting.drawing.drawing import drawing, one_by_one
+from compensation.reporting.drawing.figures import new_figure
+
+
+def test_two_processes_draw_the_same_bytes():
+    figures = []
+    for number in range(5):
+        figure, (panel,) = new_figure(3, 2, 1, 1)
+        panel.plot([0, 1, number])
+        figures.append((figure, f"figure-{number}"))
+    expected = one_by_one(figures)
+    with drawing(2) as draw:
+        assert draw(figures) == expected
+        for child in multiprocessing.active_children():
+            child.kill()
+        assert draw(figures) == expected
+    with drawing(1) as draw:
+        assert draw is one_by_one
