@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from markers.edge_model import M11, M12, M22, SIGMA, EdgeState, Float
+from markers.edge_model import CX, CY, M11, M12, M22, SIGMA, EdgeState, Float
 from markers.newton import LEAST_BAND_PX
 from markers.pixels import Mask, Picture
 
@@ -12,6 +12,8 @@ _FOLLOWED_PART = 0.9
 _GREATEST_STEP_PX = 5.0
 _GLANCE_BLURS = 3.0
 _GLANCE_CONTRAST = 0.75
+_TOWARDS = np.array([[function(k * np.pi / 8) for k in range(16)] for function in (np.cos, np.sin)])
+_TWICE = 2 * _TOWARDS[0] * _TOWARDS[1]
 _ROOM_PX, _ROOM_OF_UNSEEN = 4.0, 0.5
 """By what a marker may move, or its band grow, until rows are looked at that were not foreseen; of one that was not
 seen, in radii: the search for it begins in its place and goes further."""
@@ -21,18 +23,15 @@ def still_there(picture: Picture, state: EdgeState, is_seen: Mask, inwards: Floa
     """Whether the markers (N,) that were seen still look as they did: a glance at 16 pixels on either side of each
     outline, not nearer to the centre than `inwards` (N, 1) radii. Much cheaper than a fit that ends nowhere because the
     target has moved."""
-    p = state.parameters
-    angle = np.arange(16) * (2 * np.pi / 16)
-    towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    bend = p[:, M11, None] * towards[:, 0] ** 2 + p[:, M22, None] * towards[:, 1] ** 2
-    radius = state.scale_px[:, None] / np.sqrt(bend + 2 * p[:, M12, None] * towards[:, 0] * towards[:, 1])
-    margin = np.minimum(_GLANCE_BLURS * p[:, SIGMA, None], np.minimum(0.6, 1 - inwards) * radius)
-    limits = np.array(picture.shape[::-1]) - 1
-    levels: list[Float] = []
-    for along in (radius + margin, radius - margin):
-        place = np.rint(p[:, None, :2] + along[:, :, None] * towards).astype(int)
-        column, row = np.moveaxis(np.clip(place, 0, limits), 2, 0)
-        levels.append(picture.values_DN(row, column).mean(axis=1))
+    m11, m12, m22 = (state.parameters[:, [each]] for each in (M11, M12, M22))
+    radius = state.scale_px[:, None] / np.sqrt(m11 * _TOWARDS[0] ** 2 + m22 * _TOWARDS[1] ** 2 + m12 * _TWICE)
+    margin = np.minimum(_GLANCE_BLURS * state.parameters[:, [SIGMA]], np.minimum(0.6, 1 - inwards) * radius)
+    along = np.stack([radius + margin, radius - margin])
+    column, row = (
+        np.clip(np.rint(state.parameters[:, [axis]] + along * _TOWARDS[axis]), 0, picture.shape[1 - axis] - 1)
+        for axis in (CX, CY)
+    )
+    levels = picture.values_DN(row.astype(np.intp), column.astype(np.intp)).mean(axis=2)
     unchanged = (levels[0] - levels[1]) / state.contrast_DN() > _GLANCE_CONTRAST
     return bool(unchanged[is_seen].mean() >= _FOLLOWED_PART)
 

@@ -80,8 +80,9 @@ class Picture(NamedTuple):
     def values_DN(self, row: Columns, column: Columns) -> Columns:
         """The pixels there."""
         self.missed[0] |= not self.rows[row].all()
-        low = self.samples[row, column, 0].astype(np.int64)
-        return low if self.samples.shape[2] == 1 else low + 256 * self.samples[row, column, 1]
+        height, width, size = self.samples.shape
+        pixels = self.samples.reshape(height * width * size).view(f"<u{size}")
+        return pixels[row * width + column].astype(np.int64)
 
 
 def picture_of(image: Image, rows: Mask | None = None) -> Picture:
