@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from compensation.finding.png_rows import decode_rows
 from foundation.clock import NS_PER_S
 from foundation.readings import Frame
+from markers.detection import detect, rows_to_follow
 from markers.target import load_target
 from markers.windows import marker_windows
 from recording.format.images import IMAGE_CLASS, decode_image, encode_image
@@ -92,11 +93,19 @@ def _png(image: Image) -> list[Figure]:
         lambda: _cpu_ms(lambda: cv2.imdecode(np.frombuffer(message, np.uint8), cv2.IMREAD_UNCHANGED)),
         ROUNDS,
     )
+    target = load_target(packaged("targets", "paper-9x6"))
+    rows = rows_to_follow(detect(image, target), target, len(image))
+    in_part = in_turns(
+        lambda: _cpu_ms(lambda: decode_rows(message, room, rows)),
+        lambda: _cpu_ms(lambda: decode_rows(message, room)),
+        ROUNDS,
+    )
     sizes_MB = [len(data) / 1e6], [len(png) / 1e6]
     return [
         at_most(25, side_by_side("png, encode 5 MP of 8 bit", "CPU ms", "cv2 default PNG", *encoded)),
         side_by_side("png, decode it", "CPU ms", "cv2 default PNG", *decoded),
         side_by_side("png, decode it for the fit", "CPU ms", "cv2, the same PNG", *for_fit),
+        side_by_side("png, decode the rows that a tracker needs", "CPU ms", "all rows", *in_part),
         side_by_side("png, its size", "MB", "cv2 default PNG", *sizes_MB),
     ]
 
