@@ -6,21 +6,21 @@ pose = find_pose(camera.lens, camera.board_points, detection.centres_px, detecti
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.board import Board
 from compensation.calibration.calibrate import Calibration
-from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES, Pinhole
 from compensation.calibration.rays import RayLens, exponents
 from compensation.calibration.stage_geometry import PARAMETERS
 from foundation.documents import Document, load_json
 from foundation.files import write_whole
+from foundation.json_values import plain
 
 FORMAT = "thermostand camera"
 
@@ -174,63 +174,47 @@ def camera_file(
     """Everything a calibration found, as the file holds it."""
     lens = calibration.adjustment.scene.lens
     known = len(lens.vector) + PARAMETERS
-    return CameraFile.model_validate(
-        {
-            "software_version": software_version,
-            "camera_serial": camera_serial,
-            "session_ids": session_ids,
-            "target_name": target_name,
-            "image_size_px": lens.image_size,
-            "model": calibration.model,
-            "names": NAMES[: len(lens.vector)],
-            "vector": lens.vector.tolist(),
-            "covariance": calibration.adjustment.covariance[:known, :known].tolist(),
-            "fit": _fit(calibration),
-            "table": _table(calibration),
-            "board": _board(calibration.adjustment.adjusted_board),
-            "rays": _rays(calibration.rays),
-            "scores": [asdict(score) for score in calibration.scores],
-            "uncertainty": _uncertainty(calibration),
-        }
-    )
+    document = {
+        "software_version": software_version,
+        "camera_serial": camera_serial,
+        "session_ids": session_ids,
+        "target_name": target_name,
+        "image_size_px": lens.image_size,
+        "model": calibration.model,
+        "names": NAMES[: len(lens.vector)],
+        "vector": lens.vector,
+        "covariance": calibration.adjustment.covariance[:known, :known],
+        "fit": _fit(calibration),
+        "table": _table(calibration.adjustment),
+        "board": calibration.adjustment.adjusted_board,
+        "rays": _rays(calibration.rays),
+        "scores": calibration.scores,
+        "uncertainty": _uncertainty(calibration),
+    }
+    return CameraFile.model_validate(plain(document))
 
 
-def _fit(calibration: Calibration) -> Fit:
+def _fit(calibration: Calibration) -> dict[str, object]:
     adjustment = calibration.adjustment
-    return Fit(
-        rms_px=adjustment.rms_px,
-        detection_sigma_px=adjustment.positions.sigma_px,
-        ratio=adjustment.reprojection_ratio,
-        discrepancy_px=adjustment.discrepancy_px,
-        chi=adjustment.chi,
-        markers=int(adjustment.used.sum()),
-        outliers=int(adjustment.positions.seen.sum() - adjustment.used.sum()),
-        frame_scatter_chi=None if np.isnan(adjustment.positions.chi) else adjustment.positions.chi,
-    )
-
-
-def _table(calibration: Calibration) -> dict[str, object]:
-    adjustment = calibration.adjustment
-    table, positions = adjustment.scene.table, adjustment.positions
-    squares = np.where(adjustment.used[:, :, None], adjustment.residuals_px**2, np.nan)
     return {
-        "base_mm": table.base_mm.tolist(),
-        "linear": table.linear.tolist(),
-        "rotary": table.rotary.tolist(),
-        "mount": table.mount.tolist(),
-        "offset_mm": table.offset_mm.tolist(),
-        "linear_mm": positions.linear_mm.tolist(),
-        "rotary_deg": positions.rotary_deg.tolist(),
-        "errors_mm_rad": adjustment.scene.errors.tolist(),
-        "rms_px": np.sqrt(np.nanmean(squares, axis=(1, 2))).tolist(),
+        "rms_px": adjustment.rms_px,
+        "detection_sigma_px": adjustment.positions.sigma_px,
+        "ratio": adjustment.reprojection_ratio,
+        "discrepancy_px": adjustment.discrepancy_px,
+        "chi": adjustment.chi,
+        "markers": int(adjustment.used.sum()),
+        "outliers": int(adjustment.positions.seen.sum() - adjustment.used.sum()),
+        "frame_scatter_chi": adjustment.positions.chi,
     }
 
 
-def _board(board: Board) -> dict[str, object]:
-    return {
-        "points_mm": board.points_mm.tolist(),
-        "sigma_mm": board.sigma_mm.tolist(),
-        "diameters_mm": board.diameters_mm.tolist(),
+def _table(adjustment: Adjustment) -> dict[str, object]:
+    positions, squares = adjustment.positions, np.where(adjustment.used[:, :, None], adjustment.residuals_px**2, np.nan)
+    return plain(adjustment.scene.table) | {
+        "linear_mm": positions.linear_mm,
+        "rotary_deg": positions.rotary_deg,
+        "errors_mm_rad": adjustment.scene.errors,
+        "rms_px": np.sqrt(np.nanmean(squares, axis=(1, 2))),
     }
 
 
@@ -238,10 +222,10 @@ def _rays(rays: RayLens) -> dict[str, object]:
     return {
         "degree": rays.degree,
         "terms_pq": exponents(rays.degree),
-        "coefficients_mm": rays.coefficients.tolist(),
-        "covariance_mm2": rays.covariance.tolist(),
+        "coefficients_mm": rays.coefficients,
+        "covariance_mm2": rays.covariance,
         "range_mm": rays.range_mm,
-        "hull_px": rays.hull_px.tolist(),
+        "hull_px": rays.hull_px,
     }
 
 
@@ -249,15 +233,11 @@ def _uncertainty(calibration: Calibration) -> dict[str, object]:
     found = calibration.uncertainty
     return {
         "distance_mm": found.distance_mm,
-        "x_px": found.pixels[0, :, 0].tolist(),
-        "y_px": found.pixels[:, 0, 1].tolist(),
-        "sigma_px": _nullable(found.sigma_px),
+        "x_px": found.pixels[0, :, 0],
+        "y_px": found.pixels[:, 0, 1],
+        "sigma_px": found.sigma_px,
         "halves_rms_px": calibration.halves.rms_px,
     }
-
-
-def _nullable(values: Float) -> list[list[float | None]]:
-    return [[None if np.isnan(value) else value for value in row] for row in values.tolist()]
 
 
 def _square(name: str, rows: tuple[Row, ...], size: int) -> None:

@@ -32,7 +32,7 @@ from compensation.reporting.report import (
     write_report,
 )
 from compensation.reporting.table_positions import table_positions
-from compensation.validation3d.reading import load_validation
+from compensation.validation3d.document import load_validation
 from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors

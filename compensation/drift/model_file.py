@@ -34,6 +34,11 @@ from foundation.files import write_whole
 FORMAT = "thermostand drift model"
 SCHEMA_VERSION = 8
 
+_FACTS = (
+    *("software_version", "camera_serial", "session_ids", "target_name", "camera_range_degC", "reference_degC"),
+    *("reference_chamber_degC", "bumps"),
+)
+"""Fields of ModelFacts that a file has as they are."""
 Positive = Annotated[int, Field(gt=0)]
 Rows = tuple[tuple[float, ...], ...]
 
@@ -136,19 +141,12 @@ def _model(file: PaperFile | ThermalFile) -> DriftModel:
 def _document(model: DriftModel) -> PaperFile | ThermalFile:
     facts = model.facts
     common = {
-        "software_version": facts.software_version,
-        "camera_serial": facts.camera_serial,
-        "session_ids": facts.session_ids,
-        "target_name": facts.target_name,
+        **{name: getattr(facts, name) for name in _FACTS},
         "image_size_px": facts.image_size,
-        "camera_range_degC": facts.camera_range_degC,
-        "reference_degC": facts.reference_degC,
-        "reference_chamber_degC": facts.reference_chamber_degC,
         "reference_centres_px": [None if math.isnan(x) else (x, y) for x, y in facts.reference_centres_px.tolist()],
         "hull_px": facts.hull_px.tolist(),
         "discrepancy_px": model.discrepancy_px.tolist(),
         "candidates": model.candidates,
-        "bumps": facts.bumps,
         "other": None if model.other is None else _document(model.other),
     }
     match model:
@@ -260,17 +258,10 @@ def _facts(file: PaperFile | ThermalFile) -> ModelFacts:
     if not is_area(hull_px):
         raise ValueError("hull_px: not the corners of a convex area, in order")
     return ModelFacts(
+        **{name: getattr(file, name) for name in _FACTS},
         image_size=file.image_size_px,
-        camera_range_degC=file.camera_range_degC,
         hull_px=hull_px,
-        reference_degC=file.reference_degC,
-        reference_chamber_degC=file.reference_chamber_degC,
         reference_centres_px=np.array([centre or (math.nan, math.nan) for centre in file.reference_centres_px]),
-        target_name=file.target_name,
-        camera_serial=file.camera_serial,
-        session_ids=file.session_ids,
-        software_version=file.software_version,
-        bumps=file.bumps,
     )
 
 

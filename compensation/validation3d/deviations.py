@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -141,12 +141,10 @@ def _compared(name: str, names: tuple[str, ...], grid: list[list[Found | None]])
     repeats = [_apart(row[count], row[0]) for row in grid]
     return Deviations(
         name=name,
-        translation_um=np.array([[one.translation_um for one in row] for row in apart]),
-        rotation_mrad=np.array([[one.rotation_mrad for one in row] for row in apart]),
-        noise_um=np.array([[one.noise_um for one in row] for row in apart]),
-        model_um=np.array([[one.model_um for one in row] for row in apart]),
-        stand_um=np.array([[one.stand_um for one in row] for row in apart]),
-        u_mrad=np.array([[one.u_mrad for one in row] for row in apart]),
+        **{
+            field.name: np.array([[getattr(one, field.name) for one in row] for row in apart])
+            for field in fields(_Apart)
+        },
         repeat_um=np.array([one.translation_um for one in repeats]),
         table_um=_table_um(repeats),
         chi=np.array([[np.nan if found is None else found.chi for found in row[:count]] for row in grid]),

@@ -1,39 +1,99 @@
-"""A validation as JSON, every number with its unit in its name; null where there is no pose."""
+"""A validation as JSON, every number with its unit in its name and null where there is no pose, and read back from it:
+array for array the same, null being NaN again.
+"""
 
 from __future__ import annotations
 
 import json
-import math
-from typing import Any
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from compensation.drift.drift_model import Outside
+from compensation.observations import Float
 from compensation.validation3d.deviations import Deviations
 from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
 from compensation.validation3d.validate import Validation
 from compensation.validation3d.validation_text import reason_names
+from foundation.documents import Document, load_json
+from foundation.errors import SessionError
+from foundation.json_values import plain
 
-FORMAT = "thermostand validation"
-SCHEMA_VERSION = 1
+_AXES = "of the calibrated camera: X right and Y down in the image, Z away from the camera"
+_WRITTEN_AS = {"repeat_um": "v0_again_um"}  # fields of Deviations
+
+_Number = float | None
+_Row = tuple[_Number, ...]
+_Grid = tuple[_Row, ...]
+_Cube = tuple[_Grid, ...]
+
+
+class _Position(Document):
+    name: str
+    linear_mm: float
+    rotary_deg: float
+    distance_mm: float
+
+
+class _PaperMean(Document):
+    before: _Row
+    after: _Row
+
+
+class _Result(Document):
+    """Of a variant: arrays are [temperature][position][X, Y, Z]; temperature 0 is the reference."""
+
+    name: str
+    mean_um: _Row
+    u_mean_um: _Row
+    per_temperature_um: _Grid
+    u_per_temperature_um: _Grid
+    translation_um: _Cube
+    u_um: _Cube
+    noise_um: _Cube
+    model_um: _Cube
+    stand_um: _Cube
+    table_um: _Row
+    rotation_mrad: _Cube
+    u_mrad: _Cube
+    mean_rotation_mrad: _Row
+    v0_again_um: _Grid
+    chi: _Grid
+
+
+class _File(Document):
+    format: Literal["thermostand validation"]
+    schema_version: Literal[1]
+    session_id: str
+    simulated: bool
+    camera_model: str
+    drift_model: str
+    axes: str
+    positions: Annotated[tuple[_Position, ...], Field(min_length=1)]
+    chamber_degC: Annotated[tuple[float, ...], Field(min_length=2)]
+    camera_degC: _Row
+    frames: tuple[tuple[int, ...], ...]
+    outside_valid_range: _Grid
+    outside_because: tuple[tuple[tuple[str, ...], ...], ...]
+    paper_mean_um: _PaperMean
+    results: Annotated[tuple[_Result, ...], Field(min_length=2, max_length=4)]
 
 
 def as_json(validation: Validation) -> str:
-    """The document's text. Arrays are [temperature][position][X, Y, Z]; temperature 0 is the reference."""
+    """The document's text."""
+    places = zip(validation.names, validation.linear_mm, validation.rotary_deg, validation.distance_mm, strict=True)
     document = {
-        "format": FORMAT,
-        "schema_version": SCHEMA_VERSION,
+        "format": "thermostand validation",
+        "schema_version": 1,
         "session_id": validation.session_id,
         "simulated": validation.simulated,
         "camera_model": validation.lens,
         "drift_model": validation.model,
-        "axes": "of the calibrated camera: X right and Y down in the image, Z away from the camera",
-        "positions": [
-            {"name": name, "linear_mm": linear, "rotary_deg": rotary, "distance_mm": distance}
-            for name, linear, rotary, distance in zip(
-                validation.names, validation.linear_mm, validation.rotary_deg, validation.distance_mm, strict=True
-            )
-        ],
+        "axes": _AXES,
+        "positions": [dict(zip(_Position.model_fields, place, strict=True)) for place in places],
         "chamber_degC": validation.chamber_degC,
         "camera_degC": validation.camera_degC,
         "frames": validation.frame_count,
@@ -42,42 +102,66 @@ def as_json(validation: Validation) -> str:
         "paper_mean_um": {"before": [1e3 * mm for mm in BEFORE_mm], "after": [1e3 * mm for mm in AFTER_mm]},
         "results": [_result(one) for one in validation.variants],
     }
-    return json.dumps(_plain(document), indent=1, allow_nan=False) + "\n"
+    return json.dumps(plain(document), indent=1, allow_nan=False) + "\n"
 
 
 def _result(one: Deviations) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "mean_um": one.mean_um,
-        "u_mean_um": one.u_mean_um,
-        "per_temperature_um": one.per_temperature_um,
-        "u_per_temperature_um": one.u_per_temperature_um,
-        "translation_um": one.translation_um,
-        "u_um": one.u_um,
-        "noise_um": one.noise_um,
-        "model_um": one.model_um,
-        "stand_um": one.stand_um,
-        "table_um": one.table_um,
-        "rotation_mrad": one.rotation_mrad,
-        "u_mrad": one.u_mrad,
-        "mean_rotation_mrad": one.mean_rotation_mrad,
-        "v0_again_um": one.repeat_um,
-        "chi": one.chi,
-    }
+    attribute_of = {written: attribute for attribute, written in _WRITTEN_AS.items()}
+    return {name: getattr(one, attribute_of.get(name, name)) for name in _Result.model_fields}
 
 
-def _plain(value: Any) -> Any:
-    """Lists, numbers and null of arrays and NaN, at any depth."""
-    match value:
-        case np.ndarray():
-            return _plain(value.tolist())
-        case np.generic():
-            return _plain(value.item())
-        case dict():
-            return {key: _plain(item) for key, item in value.items()}
-        case list() | tuple():
-            return [_plain(item) for item in value]
-        case float() if not math.isfinite(value):
-            return None
-        case _:
-            return value
+def load_validation(path: Path) -> Validation:
+    """The validation in a file of `compensate validate`; SessionError when it is anything else."""
+    file = load_json(path, lambda text: _File.model_validate_json(text, strict=True), "a validation")
+    try:
+        return _validation(file)
+    except (ValueError, KeyError) as error:
+        raise SessionError(f"{path}: not a validation of this program (its arrays do not fit: {error})") from error
+
+
+def _validation(file: _File) -> Validation:
+    shape = (len(file.chamber_degC), len(file.positions))
+    before, after, *others = (_deviations(one, shape) for one in file.results)
+    camera_alone, with_stand = (*others, None, None)[:2]
+    return Validation(
+        names=tuple(one.name for one in file.positions),
+        linear_mm=np.array([one.linear_mm for one in file.positions]),
+        rotary_deg=np.array([one.rotary_deg for one in file.positions]),
+        distance_mm=np.array([one.distance_mm for one in file.positions]),
+        chamber_degC=np.array(file.chamber_degC),
+        camera_degC=_array(file.camera_degC, shape[:1]),
+        frame_count=np.array(file.frames, np.int64).reshape(shape),
+        outside=_array(file.outside_valid_range, shape),
+        flags=np.array([[_flags(names) for names in row] for row in file.outside_because], np.uint8).reshape(shape),
+        before=before,
+        after=after,
+        camera_alone=camera_alone,
+        with_stand=with_stand,
+        lens=file.camera_model,
+        model=file.drift_model,
+        session_id=file.session_id,
+        simulated=file.simulated,
+    )
+
+
+def _deviations(one: _Result, shape: tuple[int, int]) -> Deviations:
+    shapes = {"repeat_um": (shape[0], 3), "table_um": (3,), "chi": shape}
+    names = [field.name for field in fields(Deviations) if field.name != "name"]
+    arrays = {name: _array(getattr(one, _WRITTEN_AS.get(name, name)), shapes.get(name, (*shape, 3))) for name in names}
+    return Deviations(one.name, **arrays)
+
+
+def _array(values: _Row | _Grid | _Cube, shape: tuple[int, ...]) -> Float:
+    """ValueError when the values have another shape."""
+    found = np.array(values, np.float64)
+    if found.shape != shape:
+        raise ValueError(f"{found.shape} instead of {shape}")
+    return found
+
+
+def _flags(names: tuple[str, ...]) -> int:
+    """KeyError for a name that is no reason."""
+    found = 0
+    for name in names:
+        found |= Outside[name.upper().replace(" ", "_")]
+    return found

@@ -16,8 +16,7 @@ from compensation.reporting.page import page as page_of
 from compensation.reporting.report import report_page, space_section
 from compensation.reporting.table_positions import TablePositions, table_positions
 from compensation.validation3d.deviations import Deviations
-from compensation.validation3d.document import as_json
-from compensation.validation3d.reading import load_validation
+from compensation.validation3d.document import as_json, load_validation
 from compensation.validation3d.validate import Validation
 from foundation.errors import SessionError
 from foundation.items import StepMark, StepState
