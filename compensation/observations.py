@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
@@ -315,24 +315,15 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         if part.sessions[0] in [known.sessions[0] for known in parts[:index]]:
             raise SessionError(f"session {part.sessions[0].session_id} is given twice")
     lengths = np.cumsum([0] + [len(part.sessions) for part in parts])
-    return Observations(
-        target=first.target,
+    columns = ("frame", "time_ns", "role", "chamber_degC", "camera_degC", "air_degC", "centres_px", "covariance_px2")
+    return replace(
+        first,
         sessions=tuple(facts for part in parts for facts in part.sessions),
-        image_size=first.image_size,
-        preview=first.preview,
         session=np.concatenate([part.session + shift for part, shift in zip(parts, lengths, strict=False)]),
-        frame=np.concatenate([part.frame for part in parts]),
-        time_ns=np.concatenate([part.time_ns for part in parts]),
-        role=np.concatenate([part.role for part in parts]),
         step_id=tuple(step_id for part in parts for step_id in part.step_id),
-        chamber_degC=np.concatenate([part.chamber_degC for part in parts]),
-        camera_degC=np.concatenate([part.camera_degC for part in parts]),
-        air_degC=np.concatenate([part.air_degC for part in parts]),
-        centres_px=np.concatenate([part.centres_px for part in parts]),
-        covariance_px2=np.concatenate([part.covariance_px2 for part in parts]),
-        flags=np.concatenate([part.flags for part in parts]),
         reasons=tuple(reason for part in parts for reason in part.reasons),
         histories=tuple(history for part in parts for history in part.histories),
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in (*columns, "flags")},
     )
 
 

@@ -171,7 +171,8 @@ def _paper(model: Mapping[str, Any]) -> tuple[list[_CTerm], Float, int]:
     exponents = np.array(model["terms_abc"])
     degree = int(exponents.max())
     count = degree + 1
-    powers = np.array([np.pad(chebyshev.cheb2poly(row), (0, degree - k)) for k, row in enumerate(_units(degree))])
+    unit = np.eye(count)
+    powers = np.array([np.pad(chebyshev.cheb2poly(unit[k, : k + 1]), (0, degree - k)) for k in range(count)])
     full = np.zeros((2, count, count, count))
     for axis, row in enumerate(model["coefficients_px"]):
         full[axis][tuple(exponents.T)] = row
@@ -180,11 +181,6 @@ def _paper(model: Mapping[str, Any]) -> tuple[list[_CTerm], Float, int]:
     coefficients = np.stack([full[:, a, b] for a, b in places], axis=1)
     middle, half = (low + high) / 2, (high - low) / 2
     return [_CTerm("camera", 0, power, middle, half, 0.0) for power in range(count)], coefficients, degree
-
-
-def _units(degree: int) -> Iterator[Float]:
-    for k in range(degree + 1):
-        yield np.eye(degree + 1)[k, : k + 1]
 
 
 def _sides(hull_px: Float) -> Float:

@@ -26,8 +26,10 @@ def displacement_px(state: StandTemperatures, reference: StandTemperatures, geom
     """The displacement of image points (..., 2) by granite, post, target and air, from `reference` to `state`."""
     centre = (np.array(geometry.image_px) - 1) / 2
     offset = np.asarray(xy_px, dtype=np.float64) - centre
-    scale = target_strain(state, reference, geometry) - granite_mm(state, reference, geometry) / _distance_mm(geometry)
-    post = post_mm(state, reference, geometry) * geometry.focal_px / _distance_mm(geometry)
+    scale = (
+        target_strain(state, reference, geometry) - granite_mm(state, reference, geometry) / geometry.distance_mm.value
+    )
+    post = post_mm(state, reference, geometry) * geometry.focal_px / geometry.distance_mm.value
     roll = math.radians(geometry.camera_roll_deg)
     down = np.array([math.sin(roll), math.cos(roll)])
     refraction = refraction_px(state, geometry, offset) - refraction_px(reference, geometry, offset)
@@ -68,7 +70,7 @@ def target_strain(state: StandTemperatures, reference: StandTemperatures, geomet
 def refraction_px(state: StandTemperatures, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
     """How far points (..., 2), px from the principal point, appear outwards by the air's indices on both sides."""
     n1, n2 = indices(state, geometry, index)
-    return appears_px(offset_px, geometry.focal_px, _distance_mm(geometry), geometry.interface_mm.value, n1, n2)
+    return appears_px(offset_px, geometry.focal_px, geometry.distance_mm.value, geometry.interface_mm.value, n1, n2)
 
 
 def indices(state: StandTemperatures, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
@@ -78,7 +80,3 @@ def indices(state: StandTemperatures, geometry: Geometry, index: Index = ciddor_
     chamber_Pa = min(laboratory_Pa, saturation_Pa(state.air_degC))
     n1 = 1 + index(state.air_degC, pressure_Pa, chamber_Pa, geometry.wavelength_um)
     return n1, 1 + index(state.laboratory_degC, pressure_Pa, laboratory_Pa, geometry.wavelength_um)
-
-
-def _distance_mm(geometry: Geometry) -> float:
-    return geometry.distance_mm.value

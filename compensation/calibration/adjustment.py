@@ -11,7 +11,7 @@ from compensation.calibration.board import Board
 from compensation.calibration.bundle import Scene, problem_of
 from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from compensation.calibration.hand_eye import table_from_poses
-from compensation.calibration.least_squares import Float, Solution, minimise
+from compensation.calibration.least_squares import Float, Solution, lengths_in_sigmas, minimise, next_discrepancy
 from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.session_centres import Positions
@@ -111,7 +111,9 @@ def adjust(positions: Positions, board: Board, sigma: TableSigma, *, rational: b
         scene = found.solution.state
         poses = scene.table.poses(positions.linear_mm, positions.rotary_deg, scene.errors)
         shifts = shifts_by_camera(scene.lens.project, *poses, scene.points_mm, board.diameters_mm)
-        discrepancy_px = _next_discrepancy(found, positions.sigma_px)
+        discrepancy_px = found.discrepancy_px
+        if not found.is_explained:
+            discrepancy_px = next_discrepancy(positions.sigma_px**2, discrepancy_px, found.excess)
         found = _adjusted(scene, positions, board, sigma, shifts, found.inliers, discrepancy_px)
         if found.is_explained and np.array_equal(found.used, found.inliers):
             break
@@ -195,19 +197,9 @@ def _residuals(scene: Scene, positions: Positions, shifts_px: Float) -> Float:
 def _inliers(residuals_px: Float, positions: Positions, discrepancy_px: float) -> NDArray[np.bool_]:
     """(P, N): markers not far outside the scatter of all, unless those that are would be too many for accidents."""
     seen = positions.seen
-    covariance = positions.covariance_px2[seen] + discrepancy_px**2 * np.eye(2)
-    off = residuals_px[seen]
-    lengths = np.sqrt(np.einsum("mi,mij,mj->m", off, np.linalg.inv(covariance), off))
+    lengths = lengths_in_sigmas(residuals_px[seen], positions.covariance_px2[seen], discrepancy_px)
     near = lengths <= max(_LEAST_OUTLIER_SIGMA, _OUTLIER * float(np.median(lengths)) / _MEDIAN_LENGTH)
     inliers = seen.copy()
     if np.mean(~near) <= _MOST_OUTLIERS:
         inliers[seen] = near
     return inliers
-
-
-def _next_discrepancy(found: _Round, sigma_px: float) -> float:
-    """The discrepancy with which the excess would be 1 if residuals and corrections stayed as they are."""
-    if found.is_explained:
-        return found.discrepancy_px
-    variance = (sigma_px**2 + found.discrepancy_px**2) * found.excess - sigma_px**2
-    return float(np.sqrt(max(0.0, variance)))

@@ -75,6 +75,18 @@ def whiteners(covariance: Float) -> Float:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
 
 
+def next_discrepancy(sigma2_px2: float, discrepancy_px: float, excess: float) -> float:
+    """The discrepancy with which the squares would be as expected if residuals stayed as they are. excess: the squares
+    over their expectation. sigma2_px2: variance of the detection."""
+    return float(np.sqrt(max(0.0, (sigma2_px2 + discrepancy_px**2) * excess - sigma2_px2)))
+
+
+def lengths_in_sigmas(residuals_px: Float, covariance_px2: Float, discrepancy_px: float) -> Float:
+    """(M,): lengths of residuals (M, 2) in units of what noise (M, 2, 2) and discrepancy make likely."""
+    inverse = np.linalg.inv(covariance_px2 + discrepancy_px**2 * np.eye(2))
+    return np.sqrt(np.einsum("mi,mij,mj->m", residuals_px, inverse, residuals_px))
+
+
 def _scale(normal: Float) -> Float:
     diagonal = np.diag(normal)
     if not np.all(np.isfinite(diagonal)) or np.any(diagonal <= 0):

@@ -29,9 +29,7 @@ class OpencvCalibration:
     rms_px: float
 
 
-def calibrate_opencv(
-    centres_px: Float, points_mm: Float, image_size: tuple[int, int], *, rational: bool = False
-) -> OpencvCalibration:
+def calibrate_opencv(centres_px: Float, points_mm: Float, image_size: tuple[int, int]) -> OpencvCalibration:
     """Calibrate from centres (P, N, 2), NaN where missing, of board points (N, 3), of which Z is taken as 0.
 
     CalibrationError when OpenCV finds no camera.
@@ -40,16 +38,15 @@ def calibrate_opencv(
     seen = np.isfinite(centres_px[:, :, 0])
     objects = [plane[view].astype(np.float32) for view in seen]
     images = [centres[view].astype(np.float32) for centres, view in zip(centres_px, seen, strict=True)]
-    flags = cv2.CALIB_RATIONAL_MODEL if rational else 0
     try:
         rms, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-            objects, images, image_size, np.eye(3), np.zeros(8 if rational else 5), flags=flags, criteria=_CRITERIA
+            objects, images, image_size, np.eye(3), np.zeros(5), criteria=_CRITERIA
         )
     except cv2.error as error:
         raise CalibrationError(f"OpenCV finds no camera for these {len(images)} views ({error.err})") from error
     if not np.isfinite(rms):
         raise CalibrationError("OpenCV finds no camera: its fit does not converge")
     frame = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    lens = Pinhole(np.concatenate([frame, np.ravel(distortion)[: 8 if rational else 5]]), image_size)
+    lens = Pinhole(np.concatenate([frame, np.ravel(distortion)[:5]]), image_size)
     rotations = Rotation.from_rotvec(np.array(turns, np.float64).reshape(-1, 3)).as_matrix()
     return OpencvCalibration(lens, rotations, np.array(shifts, np.float64).reshape(-1, 3), float(rms))

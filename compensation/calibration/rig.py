@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from compensation.calibration.board import Board
 from compensation.calibration.bundle import lens_sigma
 from compensation.calibration.centre_corrections import shifts_by_camera
-from compensation.calibration.least_squares import Float, minimise, whiteners
+from compensation.calibration.least_squares import Float, minimise, next_discrepancy, whiteners
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.rotation import crosses
-from compensation.calibration.views import LEAST_MARKERS, POSE, Views, calibrate_views, inliers, next_discrepancy
+from compensation.calibration.views import LEAST_MARKERS, POSE, Views, calibrate_views, inliers
 from foundation.errors import CalibrationError
 
 LEAST_COMMON = 3
@@ -105,7 +105,7 @@ def calibrate_rig(cameras: Sequence[Views], board: Board) -> RigCalibration:
         if unsettled.any():
             discrepancies = np.array(
                 [
-                    next_discrepancy(views, old, value) if wrong else old
+                    next_discrepancy(views.variance_px2, old, value) if wrong else old
                     for views, old, value, wrong in zip(cameras, discrepancies, chi2, unsettled, strict=True)
                 ]
             )

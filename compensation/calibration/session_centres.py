@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,16 +60,8 @@ class Positions:
 
     def part(self, chosen: NDArray[np.bool_]) -> Positions:
         """The positions chosen (P,)."""
-        return Positions(
-            self.linear_mm[chosen],
-            self.rotary_deg[chosen],
-            self.centres_px[chosen],
-            self.covariance_px2[chosen],
-            self.frames[chosen],
-            self.flags[chosen],
-            self.chi,
-            self.image_size,
-        )
+        names = ("linear_mm", "rotary_deg", "centres_px", "covariance_px2", "frames", "flags")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
 
 def observe_positions(session: Session, target: Target, report: Report | None = None) -> Positions:

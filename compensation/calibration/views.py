@@ -18,7 +18,14 @@ from scipy.spatial.transform import Rotation
 from compensation.calibration.board import Board
 from compensation.calibration.bundle import lens_sigma
 from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
-from compensation.calibration.least_squares import Float, Solution, minimise, whiteners
+from compensation.calibration.least_squares import (
+    Float,
+    Solution,
+    lengths_in_sigmas,
+    minimise,
+    next_discrepancy,
+    whiteners,
+)
 from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.pose import find_pose
@@ -50,6 +57,11 @@ class Views:
     def seen(self) -> NDArray[np.bool_]:
         """(P, N): markers with a centre."""
         return np.isfinite(self.centres_px[:, :, 0])
+
+    @property
+    def variance_px2(self) -> float:
+        """Of a coordinate, mean over all markers."""
+        return float(np.nanmean(np.diagonal(self.covariance_px2, axis1=2, axis2=3)))
 
     def part(self, chosen: NDArray[np.bool_]) -> Views:
         """The pictures chosen (P,)."""
@@ -123,7 +135,7 @@ def calibrate_views(views: Views, board: Board) -> ViewCalibration:
         if explained:
             used = inliers(residuals, views, discrepancy_px)
         else:
-            discrepancy_px = next_discrepancy(views, discrepancy_px, chi2)
+            discrepancy_px = next_discrepancy(views.variance_px2, discrepancy_px, chi2)
         solution, residuals, chi2 = _round(solution.state, views, used, board, discrepancy_px)
         if explained and np.array_equal(before, used):
             break
@@ -244,16 +256,8 @@ def _residuals(scene: Posed, discs_px: Float) -> Float:
 def inliers(residuals_px: Float, views: Views, discrepancy_px: float) -> NDArray[np.bool_]:
     """Markers not far outside the scatter, unless those that are would be too many for accidents."""
     seen = views.seen
-    covariance = views.covariance_px2[seen] + discrepancy_px**2 * np.eye(2)
-    off = residuals_px[seen]
-    lengths = np.sqrt(np.einsum("mi,mij,mj->m", off, np.linalg.inv(covariance), off))
+    lengths = lengths_in_sigmas(residuals_px[seen], views.covariance_px2[seen], discrepancy_px)
     kept = seen.copy()
     if np.mean(lengths > _OUTLIER) <= _MOST_OUTLIERS:
         kept[seen] = lengths <= _OUTLIER
     return kept
-
-
-def next_discrepancy(views: Views, discrepancy_px: float, chi2: float) -> float:
-    """The discrepancy with which chi^2 would be 1 if the residuals stayed as they are."""
-    sigma2 = float(np.nanmean(np.diagonal(views.covariance_px2, axis1=2, axis2=3)))
-    return float(np.sqrt(max(0.0, (sigma2 + discrepancy_px**2) * chi2 - sigma2)))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.history.states import Float, Memory, States
-from compensation.history.thermal_history import states_at
+from compensation.history.thermal_history import damped_least_squares, states_at
 from compensation.observations import Observations
 from experiments.steps import Role
 from foundation.errors import SessionError
@@ -79,9 +79,7 @@ def surroundings(observations: Observations, ramp_K_per_min: float) -> Surroundi
     # While it warms up the supply's lags explain it; of a camera that has been on for long they are 1.
     terms = np.column_stack([np.ones(len(air)), air, states.ambient_lag_degC, states.power_lag - 1])
     known = np.isfinite(terms).all(axis=1) & np.isfinite(recorded_degC)
-    normal = terms[known].T @ terms[known]
-    damped = normal + _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
-    weights = np.linalg.solve(damped, terms[known].T @ recorded_degC[known])
+    weights = damped_least_squares(terms[known], recorded_degC[known], _RIDGE)
     return Surroundings(_air(observations), weights[: 2 + len(_CAMERA_TAUS_S)], ramp_K_per_min)
 
 

@@ -48,12 +48,20 @@ class Candidate(Document):
         return self.fold_squares[between(np.array(self.fold_chamber_degC))]
 
 
+def pair_of(values: Float) -> Pair:
+    """Of (2,)."""
+    i, j = values.tolist()
+    return i, j
+
+
+def rms_px(deviations: Float) -> Pair:
+    """RMS of deviations (M, 2) along I and J."""
+    return pair_of(np.sqrt((deviations**2).mean(axis=0)))
+
+
 def moving_rms_px(residual: Float) -> Pair | None:
-    """RMS along I and J of residuals (M, 2) of frames that were not at rest; None where there are none."""
-    if len(residual) == 0:
-        return None
-    i, j = np.sqrt((residual**2).mean(axis=0))
-    return float(i), float(j)
+    """RMS of residuals (M, 2) of frames that were not at rest; None where there are none."""
+    return rms_px(residual) if len(residual) else None
 
 
 def fold_means(rows: Displacements, values: Float) -> Float:

@@ -49,12 +49,8 @@ def fit(
 
 def _around(bumps: tuple[Bump, ...], model: DriftModel) -> DriftModel:
     """The model, and its other form, with the bumps that it was fitted around."""
-    match model:
-        case PaperModel() | ThermalModel():
-            other = None if model.other is None else _around(bumps, model.other)
-            return replace(model, facts=replace(model.facts, bumps=bumps), other=other)
-        case _:
-            return model
+    other = None if model.other is None else _around(bumps, model.other)
+    return replace(model, facts=replace(model.facts, bumps=bumps), other=other)
 
 
 def _fitted(observations: Observations, degree: int | None, form: Form | None, say: Say) -> DriftModel:
@@ -107,7 +103,9 @@ def better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
     """By the squares at what was left out; each gets the table with the rows of both."""
     both = paper.candidates + thermal.candidates
     in_use = [next(one for one in model.candidates if one.chosen) for model in (paper, thermal)]
-    is_thermal = _comparable(*in_use) and _predicts_better(*in_use)
+    of_paper, of_thermal = in_use
+    has_same_folds = of_paper.fold_chamber_degC == of_thermal.fold_chamber_degC
+    is_thermal = has_same_folds and _predicts_better(of_paper, of_thermal)
     form = "thermal" if is_thermal else "paper"
     rows = tuple(one.model_copy(update={"chosen": one.chosen and one.form == form}) for one in both)
     if is_thermal:
@@ -125,7 +123,3 @@ def _predicts_better(paper: Candidate, thermal: Candidate) -> bool:
             of_form.append(one[0] ** 2 + one[1] ** 2)
     rms_px = [float(np.sqrt(np.mean(of_form))) for of_form in squares]
     return rms_px[1] < rms_px[0] - NO_MATTER_PX
-
-
-def _comparable(one: Candidate, other: Candidate) -> bool:
-    return bool(np.array_equal(one.fold_chamber_degC, other.fold_chamber_degC))

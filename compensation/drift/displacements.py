@@ -5,7 +5,7 @@ Displacement always means reference position minus measured position: what must 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +35,7 @@ class Displacements:
 
     def where(self, mask: Mask) -> Displacements:
         """The rows of a mask (M,)."""
-        return Displacements(
-            self.measured_px[mask],
-            self.displacement_px[mask],
-            self.variance_px2[mask],
-            self.camera_degC[mask],
-            self.chamber_degC[mask],
-            self.frame[mask],
-            self.marker[mask],
-        )
+        return Displacements(*(getattr(self, field.name)[mask] for field in fields(self)))
 
 
 def anchors(observations: Observations) -> Mask:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import IntFlag
-from typing import Protocol
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,68 +37,58 @@ class Outside(IntFlag):
     STATE = 32
 
 
-class DriftModel(Protocol):
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DriftModel(ABC):
     """Maps measured positions of one camera to those at the reference temperature; made by choosing.fit, saved and
-    loaded by model_file. `memory` is what has to be remembered: history.states_at and states.state_of take it."""
+    loaded by model_file.
+
+    form: paper or thermal. facts: what it was fitted to. discrepancy_px (2,): what the form leaves unexplained at
+    temperatures not fitted, one standard deviation, marker noise taken off. candidates: the table of choice, of every
+    form tried. other: the other form, fitted to the same frames; None when they could not support it.
+    """
+
+    form: ClassVar[str]
+    facts: ModelFacts
+    discrepancy_px: Float
+    candidates: tuple[Candidate, ...]
+    other: DriftModel | None = None
 
     @property
-    def form(self) -> str:
-        """paper or thermal."""
-        ...
-
-    @property
-    def other(self) -> DriftModel | None:
-        """The other form, fitted to the same frames; None when they could not support it."""
-        ...
-
-    @property
+    @abstractmethod
     def title(self) -> str:
         """The form in words."""
-        ...
 
     @property
+    @abstractmethod
     def memory(self) -> Memory:
-        """What has to be remembered for it."""
-        ...
+        """What has to be remembered for it: history.states_at and states.state_of take it."""
 
-    @property
-    def facts(self) -> ModelFacts:
-        """What it was fitted to."""
-        ...
-
-    @property
-    def discrepancy_px(self) -> Float:
-        """(2,): what the form leaves unexplained, one standard deviation."""
-        ...
-
-    @property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """The table of choice."""
-        ...
-
+    @abstractmethod
     def shift(self, xy_px: Float, state: Situation) -> Float:
-        """Displacement (N, 2), px, to the reference of points (N, 2)."""
-        ...
+        """Displacement (N, 2), px, to the reference of points (N, 2) measured in these states. Outside the valid range
+        it extrapolates: ask `flags`. NaN in, and an unknown state, NaN out."""
 
     def correct(self, xy_px: Float, state: Situation) -> Float:
         """Where the points (N, 2), px, would be at the reference."""
-        ...
+        points = points_of(xy_px)
+        return points + self.shift(points, state)
 
+    @abstractmethod
     def covariance(self, xy_px: Float, state: Situation) -> Float:
-        """Covariance (N, 2, 2), px^2, of `shift`."""
-        ...
+        """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself."""
 
-    def of_sessions(self, session_ids: Iterable[str]) -> DriftModel:
-        """The model for these sessions: `covariance` is of any night, and smaller of those that were fitted."""
-        ...
+    def of_sessions(self, session_ids: Iterable[str]) -> Self:
+        """The model for these sessions: `covariance` is of any night, and smaller of those that were fitted where what
+        another night adds is not small beside what the form leaves."""
+        return self
 
+    @abstractmethod
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside; 0 is a correction as good as `covariance` says."""
-        ...
 
     def inside(self, xy_px: Float, state: Situation) -> Mask:
-        """(N,): no flag."""
-        ...
+        """(N,): whether points and states are in the calibrated range: no flag."""
+        return self.flags(xy_px, state) == 0
 
 
 def states_of(state: Situation, count: int, memory: Memory) -> States:

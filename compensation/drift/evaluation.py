@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.bumps import around_bumps
+from compensation.drift.candidates import Pair, pair_of, rms_px
 from compensation.drift.displacements import Displacements, displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_fit import degrees_for, left_out, scaling_of
@@ -33,8 +34,8 @@ class TemperatureRms:
     chamber_degC: float
     camera_degC: float
     frames: int
-    before_px: tuple[float, float]
-    after_px: tuple[float, float]
+    before_px: Pair
+    after_px: Pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,17 +57,17 @@ class Evaluation:
     after_px: Float
     claimed_px2: Float
     outside: NDArray[np.bool_]
-    coverage_95: tuple[float, float]
+    coverage_95: Pair
     temperatures: tuple[TemperatureRms, ...]
     simulated: bool
 
     @property
-    def rms_before_px(self) -> tuple[float, float]:
+    def rms_before_px(self) -> Pair:
         """RMS along I and J before compensation, px."""
         return rms_px(self.before_px)
 
     @property
-    def rms_after_px(self) -> tuple[float, float]:
+    def rms_after_px(self) -> Pair:
         """RMS along I and J after compensation, px."""
         return rms_px(self.after_px)
 
@@ -134,9 +135,8 @@ def _answered(rows: Displacements, after: Float) -> tuple[Displacements, Float]:
     return rows.where(known), after[known]
 
 
-def _coverage(after: Float, claimed: Float) -> tuple[float, float]:
-    inside = (np.abs(after) <= _SIGMA_95 * np.sqrt(claimed)).mean(axis=0)
-    return float(inside[0]), float(inside[1])
+def _coverage(after: Float, claimed: Float) -> Pair:
+    return pair_of((np.abs(after) <= _SIGMA_95 * np.sqrt(claimed)).mean(axis=0))
 
 
 def _by_temperature(rows: Displacements, after: Float) -> tuple[TemperatureRms, ...]:
@@ -154,12 +154,6 @@ def _by_temperature(rows: Displacements, after: Float) -> tuple[TemperatureRms, 
             )
         )
     return tuple(found)
-
-
-def rms_px(deviations: Float) -> tuple[float, float]:
-    """RMS of deviations (M, 2) along I and J."""
-    i, j = np.sqrt((deviations**2).mean(axis=0))
-    return float(i), float(j)
 
 
 def improvement_percent(before_px: float, after_px: float) -> float:
@@ -182,6 +176,6 @@ def table(evaluation: Evaluation) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _cells(before: tuple[float, float], after: tuple[float, float]) -> str:
+def _cells(before: Pair, after: Pair) -> str:
     pairs = zip(before, after, strict=True)
     return "".join(f"{b:10.3f}{a:10.3f}{improvement_percent(b, a):6.0f} %  " for b, a in pairs)

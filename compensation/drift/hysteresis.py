@@ -38,35 +38,20 @@ class BranchDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hysteresis:
-    """Of one session. gaps: of each set-point that was reached from below and from above. largest_px, rms_px (2,): of
-    the gaps along I and J. area_px_K (2,): between the branches. range_px (2,): of the whole drift. closure_px (2,):
-    last visit of the reference set-point minus the first, NaN when there was only one. repeatability_px (2,): standard
-    deviation of visits of the same set-point from the same side, NaN when none was repeated."""
+    """Of one session. range_px (2,): of the whole drift. largest_px, rms_px (2,): of the gaps along I and J, NaN
+    without any. area_px_K (2,): the integral of the absolute gap over the set-points, 0 with fewer than two.
+    closure_px (2,): last visit of the reference set-point minus the first, NaN when there was only one.
+    repeatability_px (2,): standard deviation of visits of the same set-point from the same side, NaN when none was
+    repeated. gaps: of each set-point that was reached from below and from above."""
 
     session_id: str
-    gaps: tuple[BranchDifference, ...]
     range_px: Float
+    largest_px: Float
+    rms_px: Float
+    area_px_K: Float
     closure_px: Float
     repeatability_px: Float
-
-    @property
-    def largest_px(self) -> Float:
-        """(2,): NaN without gaps."""
-        return np.abs(self._differences()).max(axis=0, initial=-np.inf) if self.gaps else np.full(2, np.nan)
-
-    @property
-    def rms_px(self) -> Float:
-        """(2,): NaN without gaps."""
-        return np.sqrt((self._differences() ** 2).mean(axis=0)) if self.gaps else np.full(2, np.nan)
-
-    @property
-    def area_px_K(self) -> Float:
-        """(2,): the integral of the absolute gap over the set-points; 0 with fewer than two."""
-        temperatures = np.array([gap.chamber_degC for gap in self.gaps])
-        return np.asarray(np.trapezoid(np.abs(self._differences()), temperatures, axis=0)).reshape(-1)
-
-    def _differences(self) -> Float:
-        return np.array([gap.difference_px for gap in self.gaps]).reshape(-1, 2)
+    gaps: tuple[BranchDifference, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,12 +108,18 @@ def _of_session(session_id: str, visits: list[_Visit]) -> Hysteresis:
     centres = np.array([np.nanmean(visit.place_px, axis=0) for visit in visits])
     reference = [visit for visit in visits if visit.chamber_degC == visits[0].chamber_degC]
     closure = reference[-1].place_px - reference[0].place_px
+    gaps = tuple(_gaps(visits))
+    apart_px = np.array([gap.difference_px for gap in gaps]).reshape(-1, 2)
+    unknown = np.full(2, np.nan)
     return Hysteresis(
         session_id=session_id,
-        gaps=tuple(_gaps(visits)),
         range_px=np.ptp(centres, axis=0),
-        closure_px=np.nanmean(closure, axis=0) if len(reference) > 1 else np.full(2, np.nan),
+        largest_px=np.abs(apart_px).max(axis=0) if gaps else unknown,
+        rms_px=np.sqrt((apart_px**2).mean(axis=0)) if gaps else unknown,
+        area_px_K=np.asarray(np.trapezoid(np.abs(apart_px), [gap.chamber_degC for gap in gaps], axis=0)).reshape(-1),
+        closure_px=np.nanmean(closure, axis=0) if len(reference) > 1 else unknown,
         repeatability_px=_repeatability_px(visits),
+        gaps=gaps,
     )
 
 

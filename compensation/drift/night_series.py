@@ -103,7 +103,9 @@ def night_series(observations: Observations, index: int) -> NightSeries | None:
     frames &= known
     if not frames.any():
         return None
-    rows = _in_place(displacements(observations, frames, anchors(observations)))
+    rows = displacements(observations, frames, anchors(observations))
+    # Without frames of a camera or a target that was moved on purpose.
+    rows = rows.where(np.linalg.norm(rows.displacement_px, axis=1) < _SAME_PLACE_PX)
     if not len(rows.frame):
         return None
     label = _labels(observations, rows)
@@ -137,11 +139,6 @@ def _features(observations: Observations) -> tuple[Float, Mask]:
     found = features(states, _TERMS, origin)
     fading = np.exp(-states.settled_s[:, None] / np.array(_FORGOTTEN_S))
     return np.hstack([found, fading]), np.isfinite(found).all(axis=1) & ~(states.on_s < _QUICK_S)
-
-
-def _in_place(rows: Displacements) -> Displacements:
-    """Without frames of a camera or a target that was moved on purpose."""
-    return rows.where(np.linalg.norm(rows.displacement_px, axis=1) < _SAME_PLACE_PX)
 
 
 def _labels(observations: Observations, rows: Displacements) -> Index:

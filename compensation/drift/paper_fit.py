@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means
+from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means, pair_of
 from compensation.drift.displacements import Displacements, displacements
 from compensation.drift.facts import facts_of
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
@@ -61,10 +61,11 @@ def degrees_for(rows: Displacements, degree: int | None) -> range:
     set_points = np.unique(rows.chamber_degC)
     least = _LEAST_TEMPERATURES if degree is None else degree + 2
     if len(set_points) < least:
+        listed = ", ".join(f"{value:g}" for value in set_points)
         of_degree = "" if degree is None else f" of degree {degree}"
         raise SessionError(
             f"a fit{of_degree} needs frames at {least} chamber temperatures or more, "
-            f"found {len(set_points)} ({_listed(set_points)} degC)"
+            f"found {len(set_points)} ({listed} degC)"
         )
     return range(1, min(MAX_DEGREE, len(set_points) - 2) + 1)
 
@@ -97,14 +98,13 @@ def cross_validate(rows: Displacements, scaling: Scaling, degrees: range) -> tup
 
 def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
     squares = fold_means(rows, left_out(rows, degree, scaling) ** 2)
-    rms = np.sqrt(squares.mean(axis=0))
     return DegreeScore(
         degree=degree,
         terms=len(exponents(degree)),
         condition=max(solution.condition for solution in _solutions(_condensed(rows, degree, scaling))),
-        rms_px=(float(rms[0]), float(rms[1])),
+        rms_px=pair_of(np.sqrt(squares.mean(axis=0))),
         fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
-        fold_rms_px=tuple((float(i), float(j)) for i, j in np.sqrt(squares)),
+        fold_rms_px=tuple(map(pair_of, np.sqrt(squares))),
     )
 
 
@@ -179,7 +179,3 @@ def _given(scores: tuple[DegreeScore, ...], degree: int) -> int:
     if degree not in {score.degree for score in scores}:
         raise SessionError(f"the markers do not determine a polynomial of degree {degree}; at most {len(scores)}")
     return degree
-
-
-def _listed(values: Float) -> str:
-    return ", ".join(f"{value:g}" for value in values)

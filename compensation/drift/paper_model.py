@@ -7,32 +7,19 @@ the space, so this is the same fit as that of the reference positions. compensat
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from compensation.drift.candidates import Candidate
-from compensation.drift.drift_model import (
-    DriftModel,
-    Flags,
-    Mask,
-    Outside,
-    Situation,
-    place_flags,
-    points_of,
-    range_flags,
-    states_of,
-)
-from compensation.drift.facts import ModelFacts
+from compensation.drift.candidates import Pair
+from compensation.drift.drift_model import DriftModel, Flags, Outside, Situation, place_flags, range_flags, states_of
 from compensation.drift.polynomial import Float, Scaling, design
 from compensation.history.states import Memory
 from foundation.documents import Document
 
 MAX_DEGREE = 5
-Pair = tuple[float, float]
 
 
 class DegreeScore(Document):
@@ -50,29 +37,16 @@ class DegreeScore(Document):
     fold_rms_px: tuple[Pair, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PaperModel:
-    """Maps measured positions of one camera to those at the reference temperature.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PaperModel(DriftModel):
+    """degree: n. coefficients (2, K) px and their covariance (2, K, K) px^2, rows I and J, terms in the order of
+    polynomial.exponents. scores: of every degree tried. Of a state only the camera's temperature counts."""
 
-    degree: n. coefficients (2, K) px and their covariance (2, K, K) px^2, rows I and J, terms in the order of
-    polynomial.exponents. discrepancy_px (2,): what the form leaves unexplained at temperatures not fitted, one standard
-    deviation, marker noise taken off. scores: of every degree tried. candidates: the table of choice, of every form
-    tried. other: as in DriftModel.
-    """
-
-    facts: ModelFacts
+    form = "paper"
     degree: int
     coefficients: Float
     coefficient_covariance: Float
-    discrepancy_px: Float
     scores: tuple[DegreeScore, ...]
-    candidates: tuple[Candidate, ...]
-    other: DriftModel | None = None
-
-    @property
-    def form(self) -> str:
-        """Of all models of this kind."""
-        return "paper"
 
     @property
     def memory(self) -> Memory:
@@ -90,34 +64,20 @@ class PaperModel:
         return f"degree {self.degree}, {self.score.terms} terms, condition {self.score.condition:.0f}"
 
     def shift(self, xy_px: Float, state: Situation) -> Float:
-        """Displacement (N, 2), px, to the reference temperature of points (N, 2) measured in these states, of which
-        only the camera's temperature counts. Outside the valid range it extrapolates: ask `flags`. NaN in, NaN out."""
+        """As in DriftModel."""
         return self._terms(xy_px, state) @ self.coefficients.T
 
-    def correct(self, xy_px: Float, state: Situation) -> Float:
-        """Where the points (N, 2), px, would be at the reference temperature."""
-        points = points_of(xy_px)
-        return points + self.shift(points, state)
-
     def covariance(self, xy_px: Float, state: Situation) -> Float:
-        """Covariance (N, 2, 2), px^2, of `shift`: A (A' W A)^-1 A' + s^2, without the noise of the point itself."""
+        """A (A' W A)^-1 A' + s^2."""
         terms = self._terms(xy_px, state)
         variance = np.einsum("nk,ckl,nl->nc", terms, self.coefficient_covariance, terms) + self.discrepancy_px**2
         return variance[:, :, None] * np.eye(2)
 
-    def of_sessions(self, session_ids: Iterable[str]) -> PaperModel:
-        """Itself: what another night adds is small beside what this form leaves."""
-        return self
-
     def flags(self, xy_px: Float, state: Situation) -> Flags:
-        """(N,): of Outside: PLACE and CAMERA."""
+        """PLACE and CAMERA."""
         camera_degC = states_of(state, len(xy_px), self.memory).camera_degC
         found = place_flags(xy_px, self.facts.hull_px)
         return found | range_flags(camera_degC, self.facts.camera_range_degC, Outside.CAMERA)
-
-    def inside(self, xy_px: Float, state: Situation) -> Mask:
-        """(N,): whether points and states are in the calibrated range: no flag."""
-        return self.flags(xy_px, state) == 0
 
     @property
     def score(self) -> DegreeScore:

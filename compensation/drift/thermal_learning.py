@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.drift.between_nights import between_nights
-from compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px
+from compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px, pair_of
 from compensation.drift.displacements import Displacements
 from compensation.drift.facts import facts_of
 from compensation.drift.terms import MOTIONS, PART_PLAYS, PLAYS_K, TAUS_S, TERMS, Kind, motions
@@ -118,16 +118,15 @@ def _others_know(chamber_degC: Float, night: Float, index: float) -> bool:
 def _candidate(taught: _Taught) -> Candidate:
     rows, terms = taught.rows, taught.trained.terms
     squares = fold_means(rows, taught.held_out**2)
-    i, j = np.sqrt(squares.mean(axis=0))
     return Candidate(
         form="thermal",
         name=form_name(terms),
         terms=MOTIONS * len(terms),
-        rms_px=(float(i), float(j)),
+        rms_px=pair_of(np.sqrt(squares.mean(axis=0))),
         moving_rms_px=moving_rms_px(taught.moving),
         chosen=True,
         fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
-        fold_rms_px=tuple((float(i), float(j)) for i, j in np.sqrt(squares)),
+        fold_rms_px=tuple(map(pair_of, np.sqrt(squares))),
     )
 
 

@@ -14,19 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from compensation.drift.between_nights import BetweenNights
-from compensation.drift.candidates import Candidate, Pair
-from compensation.drift.drift_model import (
-    DriftModel,
-    Flags,
-    Mask,
-    Outside,
-    Situation,
-    place_flags,
-    points_of,
-    range_flags,
-    states_of,
-)
-from compensation.drift.facts import ModelFacts
+from compensation.drift.candidates import Pair
+from compensation.drift.drift_model import DriftModel, Flags, Outside, Situation, place_flags, range_flags, states_of
 from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
 from compensation.drift_runtime import SETTLED_TAUS
 from compensation.history.states import Float, Memory, States
@@ -50,21 +39,19 @@ class ThermalRange:
     history_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ThermalModel:
-    """Maps measured positions of one camera to those at the reference temperature.
-
-    terms: H features of the thermal state. coefficients (8, H) px, each motion's with a covariance (8, H, H) px^2.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ThermalModel(DriftModel):
+    """terms: H features of the thermal state. coefficients (8, H) px, each motion's with a covariance (8, H, H) px^2.
     leverage_matrix (H, H), px^2: what features of a state are to the posterior of the shift along I and J, without what
     the covariance has beyond that; it says which states are like those of the fit.
+
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
-    the shift at the reference is about 0. discrepancy_px (2,): what the form leaves unexplained at temperatures not
-    fitted, one standard deviation, marker noise taken off; within nights. between_nights: what another night adds to
+    the shift at the reference is about 0. discrepancy_px is within nights. between_nights: what another night adds to
     it, which `covariance` contains; None in older models, in which the discrepancy has it, and of nights that were
-    fitted. has_warm_up: whether a warm-up was among the training frames. candidates, other: as in PaperModel.
+    fitted. has_warm_up: whether a warm-up was among the training frames.
     """
 
-    facts: ModelFacts
+    form = "thermal"
     terms: tuple[Term, ...]
     reference_ambient_degC: float
     self_heating_K: float
@@ -72,17 +59,9 @@ class ThermalModel:
     coefficients: Float
     coefficient_covariance: Float
     leverage_matrix: Float
-    discrepancy_px: Float
     valid: ThermalRange
     has_warm_up: bool
-    candidates: tuple[Candidate, ...]
-    other: DriftModel | None = None
     between_nights: BetweenNights | None = None
-
-    @property
-    def form(self) -> str:
-        """Of all models of this kind."""
-        return "thermal"
 
     @property
     def title(self) -> str:
@@ -96,15 +75,9 @@ class ThermalModel:
         return memory_of(self.terms, self.self_heating_K)
 
     def shift(self, xy_px: Float, state: Situation) -> Float:
-        """Displacement (N, 2), px, to the reference of points (N, 2) measured in these states. Outside the valid range
-        it extrapolates: ask `flags`. NaN in, and an unknown state, NaN out."""
+        """As in DriftModel."""
         amounts = self._features(state, len(xy_px)) @ self.coefficients.T
         return np.einsum("nak,nk->na", motions(xy_px, self.facts.image_size), amounts)
-
-    def correct(self, xy_px: Float, state: Situation) -> Float:
-        """Where the points (N, 2), px, would be at the reference."""
-        points = points_of(xy_px)
-        return points + self.shift(points, state)
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: of the coefficients, which
@@ -117,11 +90,8 @@ class ThermalModel:
         more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0)
         of_coefficients = (moved * variance[:, None, :]) @ moved.transpose(0, 2, 1)
         unexplained = of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
-        return (
-            unexplained
-            if self.between_nights is None
-            else unexplained + np.diag(np.square(self.between_nights.sigma_px))
-        )
+        known = self.between_nights
+        return unexplained if known is None else unexplained + np.diag(np.square(known.sigma_px))
 
     def of_sessions(self, session_ids: Iterable[str]) -> ThermalModel:
         """The model for these sessions: where it was fitted to all of them, without what other nights add."""
@@ -132,10 +102,6 @@ class ThermalModel:
         """(N,): of Outside."""
         states = states_of(state, len(xy_px), self.memory)
         return place_flags(xy_px, self.facts.hull_px) | self._state_flags(states)
-
-    def inside(self, xy_px: Float, state: Situation) -> Mask:
-        """(N,): whether points and states are in the calibrated range: no flag."""
-        return self.flags(xy_px, state) == 0
 
     @property
     def history_s(self) -> float:

@@ -125,7 +125,8 @@ def training(observations: Observations, terms: tuple[Term, ...], memory: Memory
     if not (frames & reference).any():
         raise SessionError("the sessions' telemetry does not give the thermal state at the reference frames")
     relative, first = _relative(observations, terms, found, against & frames)
-    rows = displacements(observations, frames & _anchored(observations, against & frames), against)
+    anchored = np.unique(observations.session[against & frames])
+    rows = displacements(observations, frames & np.isin(observations.session, anchored), against)
     rows = rows.where(_same_place(rows)[rows.frame])
     return Training(observations, rows, frames, terms, origin, states, relative, first)
 
@@ -135,11 +136,6 @@ def _trusted(observations: Observations, states: States, against: Mask) -> Mask:
     trusted = states.settled_s >= _TRUSTED_S
     known = np.unique(observations.session[trusted & against])
     return trusted | ~np.isin(observations.session, known)
-
-
-def _anchored(observations: Observations, against: Mask) -> Mask:
-    """(F,): frames of sessions that have something to be measured against."""
-    return np.isin(observations.session, np.unique(observations.session[against]))
 
 
 def _relative(observations: Observations, terms: tuple[Term, ...], found: Float, against: Mask) -> tuple[Float, Float]:

@@ -36,39 +36,15 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Unrepeated:
-    """Of one session. along_px, across_px: RMS along the line on which most is left, and across it; direction_deg: of
-    that line, from I towards J, -90..90."""
+    """Of one session. cause: what it is like. along_px, across_px: RMS along the line on which most is left, and across
+    it; direction_deg: of that line, from I towards J, -90..90. text: in a sentence."""
 
     session_id: str
+    cause: Cause
     along_px: float
     across_px: float
     direction_deg: float
-
-    @property
-    def cause(self) -> Cause:
-        """What it is like."""
-        if self.along_px < _LEAST_PX:
-            return Cause.NOTHING
-        return Cause.SLIPS if self.along_px > _ONE_LINE * self.across_px else Cause.SETTLING
-
-    @property
-    def text(self) -> str:
-        """In a sentence."""
-        along, across = 1e3 * self.along_px, 1e3 * self.across_px
-        match self.cause:
-            case Cause.SLIPS:
-                return (
-                    f"{along:.1f} mpx RMS of the image's place do not repeat, along one line at "
-                    f"{self.direction_deg:.0f} deg from I towards J ({across:.1f} across it): as of a joint that "
-                    "sticks and slips"
-                )
-            case Cause.SETTLING:
-                return (
-                    f"{along:.1f} mpx RMS of the image's place do not repeat, in no single direction ({across:.1f} "
-                    "across): as of fixings that settle differently after each change"
-                )
-            case Cause.NOTHING:
-                return f"what does not repeat of the image's place is at most {along:.1f} mpx RMS"
+    text: str
 
 
 def find_unrepeated(observations: Observations, bumps: Sequence[Bump]) -> tuple[Unrepeated, ...]:
@@ -94,6 +70,30 @@ def find_unrepeated(observations: Observations, bumps: Sequence[Bump]) -> tuple[
         values, vectors = np.linalg.eigh(left @ left.T / left.shape[1])
         across_px, along_px = np.sqrt(np.maximum(values, 0.0)).tolist()
         i, j = vectors[:, 1].tolist()
-        direction = math.degrees(math.atan2(j, i))
-        found.append(Unrepeated(series.session_id, along_px, across_px, (direction + 90) % 180 - 90))
+        direction_deg = (math.degrees(math.atan2(j, i)) + 90) % 180 - 90
+        cause = _cause(along_px, across_px)
+        text = _text(cause, 1e3 * along_px, 1e3 * across_px, direction_deg)
+        found.append(Unrepeated(series.session_id, cause, along_px, across_px, direction_deg, text))
     return tuple(found)
+
+
+def _cause(along_px: float, across_px: float) -> Cause:
+    if along_px < _LEAST_PX:
+        return Cause.NOTHING
+    return Cause.SLIPS if along_px > _ONE_LINE * across_px else Cause.SETTLING
+
+
+def _text(cause: Cause, along_mpx: float, across_mpx: float, direction_deg: float) -> str:
+    match cause:
+        case Cause.SLIPS:
+            return (
+                f"{along_mpx:.1f} mpx RMS of the image's place do not repeat, along one line at {direction_deg:.0f} "
+                f"deg from I towards J ({across_mpx:.1f} across it): as of a joint that sticks and slips"
+            )
+        case Cause.SETTLING:
+            return (
+                f"{along_mpx:.1f} mpx RMS of the image's place do not repeat, in no single direction ({across_mpx:.1f} "
+                "across): as of fixings that settle differently after each change"
+            )
+        case Cause.NOTHING:
+            return f"what does not repeat of the image's place is at most {along_mpx:.1f} mpx RMS"

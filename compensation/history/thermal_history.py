@@ -85,7 +85,7 @@ def refined(history: History) -> History:
     ambient = interpolated(history.ambient_ns, history.ambient_degC, history.camera_ns, GAP_NS)
     terms = np.column_stack([np.ones(len(shown)), ambient, states.ambient_lag_degC, states.power_lag])
     known = np.isfinite(terms).all(axis=1)
-    shape = np.where(known, terms @ _least_squares(terms[known], shown[known]), shown)
+    shape = np.where(known, terms @ damped_least_squares(terms[known], shown[known]), shown)
     changes = np.flatnonzero((np.diff(shown) != 0) & (np.diff(history.camera_ns) < _CHANGE_NS))
     if len(changes) == 0:
         return history
@@ -103,9 +103,11 @@ def _step_K(readings_degC: Float) -> float:
     return float(steps.min()) if len(steps) else 0.0
 
 
-def _least_squares(terms: Float, values: Float) -> Float:
+def damped_least_squares(terms: Float, values: Float, ridge: float = _SHAPE_RIDGE) -> Float:
+    """(K,) of terms (M, K) and values (M,); what they do not determine is near 0, by a small part `ridge` of the mean
+    square of the terms."""
     normal = terms.T @ terms
-    damped = normal + _SHAPE_RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    damped = normal + ridge * np.trace(normal) / len(normal) * np.eye(len(normal))
     return np.linalg.solve(damped, terms.T @ values)
 
 

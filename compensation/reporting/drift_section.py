@@ -7,10 +7,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from compensation.drift.hysteresis import Hysteresis
 from compensation.observations import Observations
 from compensation.reporting.drawing import drift_figures as figures
 from compensation.reporting.drawing.path_figures import EXAGGERATION, Paths, trajectories
-from compensation.reporting.numbers import HysteresisNumbers, Numbers, percent
+from compensation.reporting.numbers import Numbers, percent
 from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
 from compensation.reporting.result_section import ours
 from compensation.reporting.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
@@ -173,7 +174,7 @@ def _hysteresis_table(numbers: Numbers, several: bool) -> Table:
     return Table(heads, rows)
 
 
-def _hysteresis_cells(one: HysteresisNumbers, axis: int, whole_px: float) -> Iterator[str]:
+def _hysteresis_cells(one: Hysteresis, axis: int, whole_px: float) -> Iterator[str]:
     """whole_px: range of the drift before compensation."""
     largest_px = float(one.largest_px[axis])
     yield _mpx(float(one.range_px[axis]))

@@ -6,17 +6,17 @@ import importlib.metadata
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from datetime import UTC, datetime
 
 import numpy as np
 
 from compensation.drift.bump import Bump
 from compensation.drift.bumps import around_bumps, find_bumps
+from compensation.drift.candidates import pair_of, rms_px
 from compensation.drift.displacements import displacements
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
-from compensation.drift.hysteresis import Hysteresis, hysteresis
+from compensation.drift.hysteresis import hysteresis
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.drift.unrepeated import find_unrepeated
@@ -27,13 +27,11 @@ from compensation.reporting.formula import formula_of
 from compensation.reporting.numbers import (
     FORMAT,
     BumpNumbers,
-    HysteresisNumbers,
     ModelNumbers,
     Numbers,
     Pair,
     ScoreNumbers,
     SessionNumbers,
-    UnrepeatedNumbers,
     UnusableFrames,
     WarmUpNumbers,
 )
@@ -70,13 +68,13 @@ def numbers_of(
         unusable=tuple(_unusable(observations)),
         warm_ups=tuple(_warm_up(observations, one, model) for one in warm_ups(observations)),
         score=None if evaluation is None else _score(evaluation),
-        hysteresis_before=_hysteresis(hysteresis(observations)),
-        hysteresis_after=() if model is None else _hysteresis(hysteresis(observations, model)),
+        hysteresis_before=hysteresis(observations),
+        hysteresis_after=() if model is None else hysteresis(observations, model),
         model=None if model is None else _model(model),
         budgets=dict(extras.budgets),
         positions=extras.positions,
         bumps=tuple(_bumps(observations, bumps)),
-        unrepeated=tuple(_unrepeated(observations, bumps)),
+        unrepeated=find_unrepeated(observations, bumps),
         validation=None if validation is None else json.loads(validation_json(validation)),
         paper={"before_px": PAPER_BEFORE_PX, "after_px": PAPER_AFTER_PX, "warm_up_px": PAPER_WARM_UP_PX},
     )
@@ -92,17 +90,11 @@ def _bumps(observations: Observations, bumps: Sequence[Bump]) -> Iterator[BumpNu
             yield BumpNumbers(bump.session_id, at[0], at[1], *at_ns, *moved, bump.marker, bump.text)
 
 
-def _unrepeated(observations: Observations, bumps: Sequence[Bump]) -> Iterator[UnrepeatedNumbers]:
-    for one in find_unrepeated(observations, bumps):
-        left = one.along_px, one.across_px, one.direction_deg
-        yield UnrepeatedNumbers(one.session_id, str(one.cause), *left, one.text)
-
-
 def _session(observations: Observations, index: int) -> SessionNumbers:
     facts, own = observations.sessions[index], observations.session == index
     used = own & observations.usable
     flags = observations.flags[used]
-    by_flag = {_words(flag.name or ""): int(((flags & flag) != 0).sum()) for flag in Flag}
+    by_flag = {(flag.name or "").lower().replace("_", " "): int(((flags & flag) != 0).sum()) for flag in Flag}
     by_role = {str(role): int((own & (observations.role == str(role))).sum()) for role in Role}
     return SessionNumbers(
         session_id=facts.session_id,
@@ -123,10 +115,6 @@ def _session(observations: Observations, index: int) -> SessionNumbers:
         flags={flag: count for flag, count in by_flag.items() if count},
         doubtful=facts.doubtful,
     )
-
-
-def _words(name: str) -> str:
-    return name.lower().replace("_", " ")
 
 
 def _instant(utc_ns: int) -> str:
@@ -180,7 +168,7 @@ def _left_px(observations: Observations, one: WarmUp, model: DriftModel) -> Pair
     states = frame_states(observations, model.memory).where(rows.frame)
     left = rows.displacement_px - model.shift(rows.measured_px, states)
     known = left[np.isfinite(left).all(axis=1)]
-    return _root_mean(known**2) if len(known) else (math.nan, math.nan)
+    return rms_px(known) if len(known) else (math.nan, math.nan)
 
 
 def _score(evaluation: Evaluation) -> ScoreNumbers:
@@ -192,27 +180,16 @@ def _score(evaluation: Evaluation) -> ScoreNumbers:
         before_px=before,
         after_px=after,
         gain_percent=(improvement_percent(before[0], after[0]), improvement_percent(before[1], after[1])),
-        marker_sigma_px=_root_mean(evaluation.rows.variance_px2),
-        claimed_sigma_px=_root_mean(evaluation.claimed_px2),
+        marker_sigma_px=rms_px(np.sqrt(evaluation.rows.variance_px2)),
+        claimed_sigma_px=rms_px(np.sqrt(evaluation.claimed_px2)),
         coverage_95=evaluation.coverage_95,
         outside=float(evaluation.outside.mean()),
         temperatures=evaluation.temperatures,
     )
 
 
-def _root_mean(variance: Float) -> Pair:
-    i, j = np.sqrt(variance.mean(axis=0)).tolist()
-    return i, j
-
-
-def _hysteresis(found: tuple[Hysteresis, ...]) -> tuple[HysteresisNumbers, ...]:
-    names = [field.name for field in fields(HysteresisNumbers)]
-    return tuple(HysteresisNumbers(**{name: getattr(one, name) for name in names}) for one in found)
-
-
 def _model(model: DriftModel) -> ModelNumbers:
     facts = model.facts
-    i, j = model.discrepancy_px.tolist()
     known = model.between_nights if isinstance(model, ThermalModel) else None
     return ModelNumbers(
         form=model.form,
@@ -221,7 +198,7 @@ def _model(model: DriftModel) -> ModelNumbers:
         reference_chamber_degC=facts.reference_chamber_degC,
         camera_range_degC=facts.camera_range_degC,
         hull_px=tuple((x, y) for x, y in facts.hull_px.tolist()),
-        discrepancy_px=(i, j),
+        discrepancy_px=pair_of(model.discrepancy_px),
         between_nights_px=None if known is None else known.sigma_px,
         nights_compared=0 if known is None else known.nights,
         session_ids=facts.session_ids,

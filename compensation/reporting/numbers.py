@@ -8,17 +8,16 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass, fields, is_dataclass
-
-import numpy as np
-from pydantic import BaseModel
+from dataclasses import dataclass
 
 from compensation.budget.budget import Budget
 from compensation.drift.candidates import Candidate
 from compensation.drift.evaluation import TemperatureRms
-from compensation.drift.hysteresis import BranchDifference
+from compensation.drift.hysteresis import Hysteresis
+from compensation.drift.unrepeated import Unrepeated
 from compensation.observations import Float
 from compensation.reporting.table_positions import TablePositions
+from foundation.json_values import plain
 
 FORMAT = "thermostand report 1"
 Pair = tuple[float, float]
@@ -94,20 +93,6 @@ class ScoreNumbers:
     temperatures: tuple[TemperatureRms, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HysteresisNumbers:
-    """The figures of compensation/drift/hysteresis.py, with the ones it derives."""
-
-    session_id: str
-    range_px: Float
-    largest_px: Float
-    rms_px: Float
-    area_px_K: Float
-    closure_px: Float
-    repeatability_px: Float
-    gaps: tuple[BranchDifference, ...]
-
-
 @dataclass(frozen=True, slots=True)
 class BumpNumbers:
     """A step of the image that no thermal state explains, between the frames at `after` and `before`, the same as the
@@ -122,18 +107,6 @@ class BumpNumbers:
     motions_px: tuple[float, ...]
     sigma_px: tuple[float, ...]
     marker: int | None
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class UnrepeatedNumbers:
-    """What no thermal state explains, as in compensation/drift/unrepeated.py; cause: nothing, slips or settling."""
-
-    session_id: str
-    cause: str
-    along_px: float
-    across_px: float
-    direction_deg: float
     text: str
 
 
@@ -187,13 +160,13 @@ class Numbers:
     unusable: tuple[UnusableFrames, ...]
     warm_ups: tuple[WarmUpNumbers, ...]
     score: ScoreNumbers | None
-    hysteresis_before: tuple[HysteresisNumbers, ...]
-    hysteresis_after: tuple[HysteresisNumbers, ...]
+    hysteresis_before: tuple[Hysteresis, ...]
+    hysteresis_after: tuple[Hysteresis, ...]
     model: ModelNumbers | None
     budgets: dict[str, Budget]
     positions: TablePositions
     bumps: tuple[BumpNumbers, ...]
-    unrepeated: tuple[UnrepeatedNumbers, ...]
+    unrepeated: tuple[Unrepeated, ...]
     validation: object
     paper: dict[str, Pair]
 
@@ -230,8 +203,8 @@ def significant(value: float, digits: int) -> str:
 
 def typeset(text: str) -> str:
     """A form's name with signs and powers as they are printed."""
-    for plain, printed in (("T^2", "T²"), ("homography x ", "homography × "), ("-", "−")):
-        text = text.replace(plain, printed)
+    for written, printed in (("T^2", "T²"), ("homography x ", "homography × "), ("-", "−")):
+        text = text.replace(written, printed)
     return re.sub(r"P\^(\d)", lambda found: "P" + "⁰¹²³⁴⁵⁶⁷⁸⁹"[int(found[1])], text)
 
 
@@ -245,20 +218,4 @@ def compact(value: float, u: float) -> str:
 
 def as_json(numbers: Numbers) -> str:
     """The text of report.json: keys are the names of the fields."""
-    return json.dumps(_plain(numbers), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, BaseModel):
-        return _plain(value.model_dump())
-    if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, dict):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return json.dumps(plain(numbers), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -22,7 +22,8 @@ from compensation.history.states import States
 from compensation.observations import Observations
 from compensation.reporting.compensation_section import uncertainty_section
 from compensation.reporting.data_section import data_section
-from compensation.reporting.drawing.fit_figures import enlarged, measured_against_model
+from compensation.reporting.drawing.figures import enlarged
+from compensation.reporting.drawing.fit_figures import measured_against_model
 from compensation.reporting.extras import Extras
 from compensation.reporting.formula import formula_of
 from compensation.reporting.gather import numbers_of

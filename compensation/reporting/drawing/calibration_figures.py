@@ -14,28 +14,27 @@ from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.calibrate import Calibration
 from compensation.calibration.least_squares import Float
 from compensation.calibration.uncertainty import grid_pixels
-from compensation.reporting.drawing.figures import I_COLOUR, J_COLOUR, legend_above, new_figure, style
-
-_GREY = "#6b6b6b"
-_LONGEST_ARROW = 0.06
-"""Of the image's width: a typical large residual."""
+from compensation.reporting.drawing.figures import (
+    GREY,
+    I_COLOUR,
+    J_COLOUR,
+    arrows,
+    image_axes,
+    legend_above,
+    new_figure,
+    style,
+)
 
 
 def residual_vectors(calibration: Calibration) -> Figure:
     """Every residual as an arrow from its marker's image; one colour per table position of equal linear position."""
     adjustment = calibration.adjustment
     used, positions = adjustment.used, adjustment.positions
-    places, arrows = positions.centres_px[used], adjustment.residuals_px[used]
-    linear = np.broadcast_to(positions.linear_mm[:, None], used.shape)[used]
+    places, moved = positions.centres_px[used], adjustment.residuals_px[used]
+    linear = np.broadcast_to(positions.linear_mm[:, None], used.shape)[used].astype(np.float64)
     with style():
         figure, (axes,) = new_figure(7.4, 5.6, 1, 1)
-        scale = _arrow_scale(arrows, positions.image_size[0])
-        drawn = axes.quiver(
-            *places.T, *(scale * arrows).T, linear, angles="xy", scale_units="xy", scale=1, width=0.0012, cmap="viridis"
-        )
-        drawn.set_rasterized(True)
-        _image_axes(axes, positions.image_size)
-        _scale_arrow(axes, positions.image_size, scale)
+        drawn = arrows(axes, places, moved, positions.image_size, linear, width=0.0012, cmap="viridis")
         figure.colorbar(drawn, ax=axes, label="linear position (mm)", shrink=0.85, pad=0.02)
     return figure
 
@@ -52,7 +51,7 @@ def residual_sizes(calibration: Calibration) -> Figure:
             for values, colour, label in zip(rms_mpx.T, (I_COLOUR, J_COLOUR), ("x", "y"), strict=True):
                 axes.plot(number, values, "o-", color=colour, markersize=2.6, linewidth=0.8, label=label)
             sigma_mpx = 1e3 * adjustment.positions.sigma_px
-            axes.axhline(sigma_mpx, color=_GREY, linewidth=0.8, linestyle="--", label="detection sigma")
+            axes.axhline(sigma_mpx, color=GREY, linewidth=0.8, linestyle="--", label="detection sigma")
             axes.set_xlabel(name)
             legend_above(axes)
         panels[0].set_ylabel("RMS residual (mpx)")
@@ -94,7 +93,7 @@ def uncertainty_map(calibration: Calibration) -> Figure:
         for axes in panels:
             places = calibration.adjustment.positions.centres_px[used]
             axes.plot(*places.T, ",", color="white", alpha=0.5, rasterized=True)
-            _image_axes(axes, calibration.adjustment.positions.image_size)
+            image_axes(axes, calibration.adjustment.positions.image_size)
     return figure
 
 
@@ -105,15 +104,10 @@ def rays_against_pinhole(calibration: Calibration) -> Figure:
     inside = rays.inside(pixels)
     slopes = lens.slopes(pixels[inside])
     points = np.column_stack([slopes, np.ones(len(slopes))]) * calibration.uncertainty.distance_mm
-    arrows = -rays.misfit(points, pixels[inside])
+    moved = -rays.misfit(points, pixels[inside])
     with style():
         figure, (axes,) = new_figure(7.4, 5.2, 1, 1)
-        scale = _arrow_scale(arrows, lens.image_size[0])
-        axes.quiver(
-            *pixels[inside].T, *(scale * arrows).T, angles="xy", scale_units="xy", scale=1, width=0.0018, color=I_COLOUR
-        )
-        _image_axes(axes, lens.image_size)
-        _scale_arrow(axes, lens.image_size, scale)
+        arrows(axes, pixels[inside], moved, lens.image_size, width=0.0018, color=I_COLOUR)
     return figure
 
 
@@ -143,7 +137,7 @@ def model_scores(calibration: Calibration) -> Figure:
             capsize=3,
         )
         sigma_mpx = 1e3 * calibration.adjustment.positions.sigma_px
-        axes.axvline(sigma_mpx, color=_GREY, linewidth=0.8, linestyle="--", label="detection sigma")
+        axes.axvline(sigma_mpx, color=GREY, linewidth=0.8, linestyle="--", label="detection sigma")
         axes.set_yticks(places, [score.model for score in scores])
         axes.set_ylim(len(scores) - 0.5, -0.5)
         axes.set_xlabel("RMS at held-out positions, per coordinate (mpx)")
@@ -156,7 +150,7 @@ def _board_corrections(axes: Axes, adjustment: Adjustment) -> None:
     moved_um = 1e3 * (adjustment.scene.points_mm - adjustment.board.points_mm)
     sigma_um = 1e3 * adjustment.points_sigma_mm
     number = np.arange(1, len(moved_um) + 1)
-    for index, (name, colour) in enumerate((("X", I_COLOUR), ("Y", J_COLOUR), ("Z", _GREY))):
+    for index, (name, colour) in enumerate((("X", I_COLOUR), ("Y", J_COLOUR), ("Z", GREY))):
         axes.errorbar(
             number,
             moved_um[:, index],
@@ -184,25 +178,3 @@ def _table_corrections(axes: Axes, adjustment: Adjustment) -> None:
 def _contours(figure: Figure, axes: Axes, pixels: Float, values: Float, label: str) -> None:
     drawn = axes.contourf(pixels[..., 0], pixels[..., 1], values, levels=12, cmap="viridis")
     figure.colorbar(drawn, ax=axes, label=label, orientation="horizontal", pad=0.02, shrink=0.9)
-
-
-def _image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
-    width, height = image_size
-    axes.set(xlabel="x (px)", ylabel="y (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-    axes.grid(visible=False)
-
-
-def _arrow_scale(arrows: Float, width: int) -> float:
-    """By how much arrows are drawn longer: a power of ten times 1, 2 or 5."""
-    long = float(np.quantile(np.linalg.norm(arrows, axis=1), 0.95))
-    wanted = _LONGEST_ARROW * width / max(long, 1e-9)
-    power = 10 ** math.floor(math.log10(wanted))
-    return next(step * power for step in (5, 2, 1) if step * power <= wanted)
-
-
-def _scale_arrow(axes: Axes, image_size: tuple[int, int], scale: float) -> None:
-    """What a round number of mpx looks like, in the corner."""
-    width, height = image_size
-    length_px = 10 ** math.floor(math.log10(0.1 * width / scale))
-    axes.plot([0.03 * width, 0.03 * width + scale * length_px], [0.96 * height] * 2, color="black", linewidth=2)
-    axes.text(0.04 * width + scale * length_px, 0.96 * height, f"{1e3 * length_px:g} mpx", va="center", fontsize=8)

@@ -6,21 +6,30 @@ Blue is I and orange J (Okabe and Ito, safe for the colour-blind); pale and open
 from __future__ import annotations
 
 import io
+import math
 import re
 from contextlib import AbstractContextManager
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.quiver import Quiver
+
+from compensation.observations import Float
 
 I_COLOUR, J_COLOUR = "#0072B2", "#D55E00"
 CAMERA_COLOUR, GREY, WARM_UP_COLOUR = "#CC79A7", "#6b6b6b", "#F0E442"
 SPOT_COLOURS = ("#009E73", "#E69F00", "#56B4E9")
 COORDINATES = (("I", I_COLOUR), ("J", J_COLOUR))
+PALE, ON_PALE = "#ececec", "#111111"
+"""The ground of pictures, and ink on it: both stay as they are where a page is dark."""
 FULL_WIDTH_IN = 7.4
+_LONGEST_ARROW = 0.06
+"""Of the image's width: a typical large one."""
 LAYOUT: Literal["constrained"] | None = "constrained"
 """How the panels of a figure find their places; None: they keep the first."""
 _STYLE = {
@@ -82,3 +91,37 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
     for handle in shown.legend_handles:
         if isinstance(handle, Line2D):
             handle.set(markersize=max(handle.get_markersize(), _LEGEND_MARKER), alpha=1)
+
+
+def image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
+    """Those of an image (width, height), px."""
+    width, height = image_size
+    axes.set(xlabel="column I (px)", ylabel="row J (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    axes.set_aspect("equal")
+    axes.grid(visible=False)
+
+
+def arrows(
+    axes: Axes, at_px: Float, moved_px: Float, image_size: tuple[int, int], *colours: Float, **look: Any
+) -> Quiver:
+    """Motions (M, 2) of places (M, 2) over the image, enlarged until the larger ones show; a bar says how much. colours
+    (M,): a value of each. look: of the arrows."""
+    width, height = image_size
+    scale, bar_px = enlarged(float(np.quantile(np.linalg.norm(moved_px, axis=1), 0.95)), width)
+    lengths = {"angles": "xy", "scale_units": "xy", "scale": 1}
+    drawn = axes.quiver(*at_px.T, *(scale * moved_px).T, *colours, **lengths, **look)
+    drawn.set_rasterized(True)
+    image_axes(axes, image_size)
+    x, y = 0.03 * width, 0.965 * height
+    axes.plot([x, x + scale * bar_px], [y, y], color=ON_PALE, linewidth=2, solid_capstyle="butt")
+    text = f"{1e3 * bar_px:g} mpx, {scale:,.0f} times"
+    axes.text(x + scale * bar_px + 0.01 * width, y, text, va="center", fontsize=8, color=ON_PALE)
+    return drawn
+
+
+def enlarged(long_px: float, width: int) -> tuple[float, float]:
+    """By how much an arrow of this length is drawn longer, a round number, and a round length for the bar beside it."""
+    wanted = _LONGEST_ARROW * width / max(long_px, 1e-9)
+    power = 10 ** math.floor(math.log10(wanted))
+    scale = next(step * power for step in (5, 2, 1) if step * power <= wanted)
+    return scale, 10 ** math.floor(math.log10(0.1 * width / scale))

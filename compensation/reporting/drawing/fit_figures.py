@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,16 +9,22 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from compensation.drift.evaluation import Evaluation, improvement_percent
 from compensation.observations import Float, Observations
-from compensation.reporting.drawing.figures import COORDINATES, FULL_WIDTH_IN, legend_above, new_figure, style
-from compensation.reporting.drawing.path_figures import ON_PALE, PALE, Paths, temperature_colours, trajectories
+from compensation.reporting.drawing.figures import (
+    COORDINATES,
+    FULL_WIDTH_IN,
+    PALE,
+    arrows,
+    legend_above,
+    new_figure,
+    style,
+)
+from compensation.reporting.drawing.path_figures import Paths, temperature_colours, trajectories
 from compensation.reporting.numbers import percent
 from compensation.reporting.tracks import thinned
 
 _SIGMA_95 = 1.959964
 _MOST_DOTS = 20_000
 _BINS = 60
-_LONGEST_ARROW = 0.06
-"""Of the image's width: a large residual."""
 
 
 def compensated_paths(observations: Observations, evaluation: Evaluation) -> Figure:
@@ -64,45 +68,18 @@ def residual_map(observations: Observations, evaluation: Evaluation) -> Figure:
     """What is left at each marker of each scored set-point, as arrows over the image, enlarged until the larger ones
     show; the bar says how much."""
     rows = evaluation.rows
-    width, height = observations.image_size
     keys = np.stack([rows.chamber_degC, rows.marker], axis=1)
     groups, index, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     index = index.ravel()
     mean = [np.bincount(index, column) / count for column in (*rows.measured_px.T, *(-evaluation.after_px).T)]
-    longest = float(np.quantile(np.hypot(mean[2], mean[3]), 0.95))
-    scale, bar_px = enlarged(longest, width)
     with style():
         figure, (axes,) = new_figure(FULL_WIDTH_IN, 5.4, 1, 1)
-        at, arrows = np.stack(mean[:2], axis=1), scale * np.stack(mean[2:], axis=1)
-        drawn = axes.quiver(
-            *at.T,
-            *arrows.T,
-            groups[:, 0],
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            width=0.002,
-            cmap=temperature_colours(),
-        )
-        drawn.set_rasterized(True)
-        axes.set(xlabel="column I (px)", ylabel="row J (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-        axes.set_aspect("equal")
-        axes.grid(visible=False)
+        at, moved = np.stack(mean[:2], axis=1), np.stack(mean[2:], axis=1)
+        look = {"width": 0.002, "cmap": temperature_colours()}
+        drawn = arrows(axes, at, moved, observations.image_size, groups[:, 0].astype(np.float64), **look)
         axes.set_facecolor(PALE)
-        x, y = 0.03 * width, 0.965 * height
-        axes.plot([x, x + scale * bar_px], [y, y], color=ON_PALE, linewidth=2, solid_capstyle="butt")
-        text = f"{1e3 * bar_px:g} mpx, {scale:,.0f} times"
-        axes.text(x + scale * bar_px + 0.01 * width, y, text, va="center", fontsize=8, color=ON_PALE)
         figure.colorbar(drawn, ax=axes, label="chamber temperature (°C)", shrink=0.85, pad=0.02)
     return figure
-
-
-def enlarged(long_px: float, width: int) -> tuple[float, float]:
-    """By how much an arrow of this length is drawn longer, a round number, and a round length for the bar beside it."""
-    wanted = _LONGEST_ARROW * width / max(long_px, 1e-9)
-    power = 10 ** math.floor(math.log10(wanted))
-    scale = next(step * power for step in (5, 2, 1) if step * power <= wanted)
-    return scale, 10 ** math.floor(math.log10(0.1 * width / scale))
 
 
 def residuals(evaluation: Evaluation) -> Figure:

@@ -14,14 +14,12 @@ from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from compensation.observations import Float, Observations
-from compensation.reporting.drawing.figures import FULL_WIDTH_IN, new_figure, style
+from compensation.reporting.drawing.figures import FULL_WIDTH_IN, ON_PALE, PALE, image_axes, new_figure, style
 from compensation.reporting.tracks import thinned
 
 EXAGGERATION = 100
 _PATH_POINTS = 600
 _SAME_VIEW_PX = 5.0
-PALE, ON_PALE = "#ececec", "#111111"
-"""The ground of pictures, and ink on it: both stay as they are where a page is dark."""
 _BOX = {"boxstyle": "square,pad=0.15", "facecolor": PALE, "edgecolor": "none", "alpha": 0.8}
 _GREY_STEP = 8
 """A coarser picture has no noise to store."""
@@ -93,10 +91,8 @@ def _ground(axes: Axes, observations: Observations, start_px: Float) -> None:
         )
     else:
         _outlines(axes, observations, start_px)
-    axes.set(xlabel="column I (px)", ylabel="row J (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    image_axes(axes, observations.image_size)
     axes.label_outer()
-    axes.set_aspect("equal")
-    axes.grid(visible=False)
     _scale_bar(axes, width, height)
 
 
