@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.arrays import observations_of
+from compensation.csv_rows import Row, numbers, read_rows
 from compensation.observations import Float, Observations
 from experiments.steps import Role
 from foundation.errors import SessionError
@@ -18,8 +18,8 @@ from foundation.errors import SessionError
 NEEDED = ("frame", "marker", "x_px", "y_px", "camera_degC")
 OF_FRAMES = ("camera_degC", "time_ns", "chamber_degC", "role", "air_degC")
 _COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+_ROW_EACH = f"it needs {', '.join(NEEDED)}, a row for each centre"
 _MOST_FRAMES, _MOST_MARKERS = 1_000_000, 100_000
-Row = Mapping[str, str]
 Index = NDArray[np.int64]
 
 
@@ -40,7 +40,7 @@ def observations_of_table(path: Path, camera_serial: str = "") -> Observations:
     shape = (len(frame), int(marker.max()) + 1)
     centres, covariance = np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
     at = frame_at, marker[marker_at]
-    centres[at] = np.column_stack([_numbers(path, rows, "x_px"), _numbers(path, rows, "y_px")])
+    centres[at] = np.column_stack([numbers(path, rows, "x_px"), numbers(path, rows, "y_px")])
     of_frames = {name: _of_frames(path, rows, frame_at, name) for name in OF_FRAMES if name in rows[0]}
     times = of_frames.get("time_ns")
     time_ns = None if times is None else np.array([_instant(path, text) for text in times], np.int64)
@@ -69,24 +69,12 @@ def observations_of_table(path: Path, camera_serial: str = "") -> Observations:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, strict=True)
-            rows = list(reader)
-            columns = reader.fieldnames or []
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SessionError(f"{path}: cannot be read as a CSV table ({error})") from error
-    missing = [name for name in NEEDED if name not in columns]
-    some = [name for name in _COVARIANCE if name in columns]
-    if some and len(some) < len(_COVARIANCE):
-        missing += [name for name in _COVARIANCE if name not in columns]
-    if missing:
-        raise SessionError(f"{path}: has no column {missing[0]}; it needs {', '.join(NEEDED)}, a row for each centre")
+    rows, columns = read_rows(path, NEEDED, _ROW_EACH)
+    missing = [name for name in _COVARIANCE if name not in columns]
+    if missing and len(missing) < len(_COVARIANCE):
+        raise SessionError(f"{path}: has no column {missing[0]}; {_ROW_EACH}")
     if not rows:
         raise SessionError(f"{path}: has no rows; it needs one for each centre")
-    for line, row in enumerate(rows, 2):
-        if None in row or None in row.values():
-            raise SessionError(f"{path}: line {line} has not as many cells as the first line")
     return rows
 
 
@@ -100,24 +88,9 @@ def _numbered(path: Path, rows: Sequence[Row], column: str, most: int) -> tuple[
     return found, at.ravel().astype(np.int64)
 
 
-def _numbers(path: Path, rows: Sequence[Row], column: str) -> Float:
-    return np.array([_number(path, line, column, row[column]) for line, row in enumerate(rows, 2)])
-
-
-def _number(path: Path, line: int, column: str, text: str) -> float:
-    """NaN of an empty cell."""
-    try:
-        value = float(text) if text.strip() else math.nan
-    except ValueError:
-        raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a number") from None
-    if math.isinf(value):
-        raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a finite number")
-    return value
-
-
 def _covariances(path: Path, rows: Sequence[Row]) -> Float:
     """(M, 2, 2); SessionError where it is none."""
-    xx, xy, yy = (_numbers(path, rows, name) for name in _COVARIANCE)
+    xx, xy, yy = (numbers(path, rows, name) for name in _COVARIANCE)
     placed = np.array([bool(row["x_px"].strip()) for row in rows])
     wrong = placed & ~((xx > 0) & (yy > 0) & (xx * yy > xy**2))
     if wrong.any():

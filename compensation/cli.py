@@ -7,6 +7,7 @@ import sys
 from foundation.usage import Lazy, lazy_app
 
 _APPLY, _FIT = "compensation.commands.apply_cli", "compensation.commands.fit_cli"
+_FEW = "compensation.commands.few_frames_cli"
 
 
 app = lazy_app(
@@ -19,8 +20,8 @@ app = lazy_app(
         "datasheet": Lazy(
             "compensation.commands.datasheet_cli", "Write a camera's thermal datasheet, with uncertainties."
         ),
-        "fit-like": Lazy("compensation.commands.like_cli", "Fit a new unit of a camera type to few frames."),
-        "anchor": Lazy("compensation.commands.anchor_cli", "Fit a model to where the target is in a new session."),
+        "fit-like": Lazy(_FEW, "Fit a new unit of a camera type to few frames."),
+        "anchor": Lazy(_FEW, "Fit a model to where the target is in a new session."),
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
         "export": Lazy(_APPLY, "Write the model for other programs: in Python with numpy only, in C, for ROS 2."),
         "calibrate": Lazy("compensation.commands.calibration_cli", "Calibrate the camera: pinhole and ray model."),

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import csv
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-
+from compensation.csv_rows import Row, read_rows
 from compensation.drift.drift_model import DriftModel, Outside
 from compensation.history.states import Float, States
 from foundation.errors import ConfigError, SessionError
@@ -17,43 +15,16 @@ from foundation.files import whole_file
 X, Y, TIME, CAMERA = "x_px", "y_px", "time_ns", "camera_degC"
 ADDED = ("x_reference_px", "y_reference_px", "var_x_correction_px2", "cov_xy_correction_px2", "var_y_correction_px2",
          "outside")  # fmt: skip
-Row = Mapping[str, str]
 
 
 def read_points(path: Path) -> list[dict[str, str]]:
     """The rows of a table with columns x_px and y_px, such as `compensate detect` writes; SessionError when it has
     none, or a row that does not fit."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file, strict=True)
-            rows = list(reader)
-            columns = reader.fieldnames or []
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SessionError(f"{path}: cannot be read as a CSV table ({error})") from error
-    missing = [name for name in (X, Y) if name not in columns]
-    if missing:
-        raise SessionError(
-            f"{path}: has no column {missing[0]}; it needs {X} and {Y}, as compensate detect writes them"
-        )
+    rows, columns = read_rows(path, (X, Y), f"it needs {X} and {Y}, as compensate detect writes them")
     taken = [name for name in ADDED if name in columns]
     if taken:
         raise SessionError(f"{path}: has a column {taken[0]} already; these points have been corrected")
-    for line, row in enumerate(rows, 2):
-        if None in row or None in row.values():
-            raise SessionError(f"{path}: line {line} has not as many cells as the first line")
     return rows
-
-
-def numbers(path: Path, rows: Sequence[Row], column: str) -> Float:
-    """(M,): a column's values, NaN for `nan` and empty cells; SessionError that names the line of anything else."""
-    values: list[float] = []
-    for line, row in enumerate(rows, 2):
-        text = row[column].strip()
-        try:
-            values.append(float(text) if text else math.nan)
-        except ValueError:
-            raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a number") from None
-    return np.array(values)
 
 
 def times(path: Path, rows: Sequence[Row]) -> list[int]:

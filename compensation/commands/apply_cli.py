@@ -18,7 +18,6 @@ from compensation.apply.compensate_points import (
     CAMERA,
     X,
     Y,
-    numbers,
     outside_text,
     read_points,
     times,
@@ -27,6 +26,7 @@ from compensation.apply.compensate_points import (
 from compensation.apply.ros2_package import export_ros2
 from compensation.apply.runtime_export import export
 from compensation.commands.options import CameraName, Incomplete, open_session
+from compensation.csv_rows import numbers
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.model_file import load_model
 from compensation.drift.paper_model import PaperModel

@@ -11,9 +11,11 @@ import typer
 
 from compensation.commands.options import (
     Incomplete,
+    MegapixelsOption,
     TargetOption,
     installed_target,
     said_if,
+    say_left_out,
 )
 from compensation.observations import read_frames, session_target
 from foundation.command_app import App
@@ -21,21 +23,17 @@ from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
-from foundation.output import say, show
+from foundation.output import show
 from foundation.progress import Report, late_progress
 from foundation.usage import one_line
 from markers.detection import Detection, DetectionError, Image, detect, nothing_found
-from markers.detections_table import CENTRES, DetectedImage, doubt, write_detections
+from markers.detections_table import CENTRES, DetectedImage, write_detections
 from markers.image_file import read_image
 from markers.target import Target
 from recording.reading.session import Session
 from recording.reading.using import open_whole
 
 app = App()
-
-MegapixelsOption = Annotated[
-    float, typer.Option("--max-megapixels", min=0.001, max=2000.0, help="Larger images are refused, unread.")
-]
 
 _DEFAULT_TARGET = "paper-9x6"
 
@@ -65,10 +63,7 @@ def detect_images(
             write_detections(out, chosen, _detections(opened, chosen, failures, doubtful, report))
         shown = {"table": out, "target": chosen.name, "not_found": failures, "doubtful": doubtful}
         show(shown, [CENTRES, chosen.orientation])
-        for failure in failures:
-            say(f"not found in {failure}")
-        if doubtful:
-            say(doubt(len(doubtful)))
+        say_left_out("not found in", failures, doubtful)
 
 
 def _open(path: Path, incomplete: bool) -> Session | Path:
@@ -107,11 +102,10 @@ def _detections(
     for source in sources:
         previous: Detection | None = None
         for name, time_ns, image in _images(source, several):
-            watch = partial(_report_part, report, images, name)
             images += 1
             try:
                 # Photographs need not be of one pose: only frames of a session are tracked.
-                found = detect(image, target, previous, watch=watch)
+                found = detect(image, target, previous, watch=partial(_report_part, report, images - 1, name))
                 previous = found if isinstance(source, Session) else None
             except DetectionError as error:
                 failures.append(f"{name}: {error}")

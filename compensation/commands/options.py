@@ -16,6 +16,7 @@ from compensation.one_camera import take
 from foundation.errors import ConfigError
 from foundation.output import say
 from foundation.progress import progress
+from markers.detections_table import doubt
 from markers.target import Target, load_target
 from recording.reading.session import Session
 from recording.reading.using import Say, open_whole
@@ -29,6 +30,9 @@ CameraName = Annotated[
 DetailsOption = Annotated[
     Path | None,
     typer.Option(help="A file that states what no recording knows: lens, certificates, places of sensors, u_air_K."),
+]
+MegapixelsOption = Annotated[
+    float, typer.Option("--max-megapixels", min=0.001, max=2000.0, help="Larger images are refused, unread.")
 ]
 Incomplete = Annotated[bool, typer.Option("--incomplete", help="Use a session although part of it is missing.")]
 
@@ -88,3 +92,11 @@ def named_target(name: str | None) -> Target | None:
 def said_if(incomplete: bool) -> Say | None:
     """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
     return (lambda text: say(f"warning: {text}")) if incomplete else None
+
+
+def say_left_out(what: str, failures: Sequence[str], doubtful: Sequence[str]) -> None:
+    """Messages about images that were not used, and those that noise does not describe."""
+    for failure in failures:
+        say(f"{what} {failure}")
+    if doubtful:
+        say(doubt(len(doubtful)))

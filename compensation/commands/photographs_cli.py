@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from compensation.calibration.board import board_of, board_of_corners
+from compensation.calibration.board import Board, board_of, board_of_corners
 from compensation.calibration.exports import EXPORTS, write_exports
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.view_uncertainty import in_words
 from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
-from compensation.commands.options import installed_target
+from compensation.commands.options import MegapixelsOption, installed_target, say_left_out
 from foundation.command_app import App
 from foundation.errors import CalibrationError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
-from foundation.output import say, show
+from foundation.output import show
 from foundation.progress import Report, progress
 from markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
 from markers.detection import DetectionError, Image, detect
-from markers.detections_table import doubt
 from markers.image_file import read_image
 from markers.target import Target
 
@@ -44,9 +44,7 @@ def calibrate_photographs(
     distance_mm: Annotated[
         float | None, typer.Option(min=1, help="Where the uncertainty is stated; else the pictures' mean distance.")
     ] = None,
-    max_megapixels: Annotated[
-        float, typer.Option("--max-megapixels", min=0.001, max=2000.0, help="Larger images are refused, unread.")
-    ] = GREATEST_MEGAPIXELS,
+    max_megapixels: MegapixelsOption = GREATEST_MEGAPIXELS,
 ) -> None:
     """Calibrate a camera from photographs of the target in any poses: Brown's pinhole, with the board adjusted.
 
@@ -63,12 +61,9 @@ def calibrate_photographs(
         failures: list[str] = []
         doubtful: list[str] = []
         with progress("find markers", len(images)) as report:
-            views = _views(images, board, failures, doubtful, report)
-        for failure in failures:
-            say(f"not used: {failure}")
-        if doubtful:
-            say(doubt(len(doubtful)))
-        known = board_of(board) if isinstance(board, Target) else board_of_corners(board)
+            seen = views_of([(path, path.name) for path in images], board, failures, doubtful, report)
+        say_left_out("not used:", failures, doubtful)
+        views, known = seen.part(np.asarray(seen.seen.any(axis=1))), known_board(board)
         found = calibrate_views(views, known)
         write_exports(export, found.scene.lens, "camera", found.rms_px)
         at_mm = distance_mm or float(np.mean(found.scene.translations_mm[:, 2]))
@@ -112,44 +107,57 @@ def described(name: str) -> Target | BoardOfCorners:
     return corners or installed_target(name)
 
 
-def look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
+def known_board(board: Target | BoardOfCorners) -> Board:
+    """What is known of it before a calibration."""
+    return board_of(board) if isinstance(board, Target) else board_of_corners(board)
+
+
+def views_of(
+    pictures: Sequence[tuple[Path | None, str]],
+    board: Target | BoardOfCorners,
+    failures: list[str],
+    doubtful: list[str],
+    report: Report,
+) -> Views:
+    """What a camera sees in each of its pictures, NaN where there is none or it does not show enough; `failures` grows
+    by a line for each that is not used, `doubtful` by the names of those that noise does not describe.
+
+    CalibrationError when the target is in none, or they are of different sizes.
+    """
+    centres: Float = np.full((len(pictures), board.count, 2), np.nan)
+    covariances: Float = np.full((len(pictures), board.count, 2, 2), np.nan)
+    size: tuple[int, int] | None = None
+    for number, (path, name) in enumerate(pictures):
+        report(number, name)
+        if path is None:
+            continue
+        try:
+            pixels = read_image(path)
+            found, covariance, is_doubtful = _look(pixels, board)
+        except DetectionError as error:
+            failures.append(f"{name}: {error}")
+            continue
+        shape = (pixels.shape[1], pixels.shape[0])
+        if size not in (None, shape):
+            raise CalibrationError(f"{path}: the picture has {shape[0]} x {shape[1]} pixels, those before it {size}")
+        size = shape
+        count = np.count_nonzero(np.isfinite(found[:, 0]))
+        if count < LEAST_MARKERS:
+            failures.append(f"{name}: {count} markers, {LEAST_MARKERS} are needed")
+            continue
+        doubtful += [name] * is_doubtful
+        centres[number], covariances[number] = found, covariance
+    if size is None:
+        raise CalibrationError(
+            f"the target is in none of the pictures: {failures[0] if failures else 'there are none'}"
+        )
+    return Views(centres, covariances, size)
+
+
+def _look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
     """Points (N, 2) px and their covariances (N, 2, 2) in a picture, and whether these are doubtful; DetectionError
     when the target is not in it."""
     if isinstance(target, Target):
         found = detect(image, target)
         return found.centres_px, found.covariance_px2, found.is_doubtful
     return find_corners(image, target), np.tile(SIGMA_px**2 * np.eye(2), (target.count, 1, 1)), False
-
-
-def _views(
-    images: list[Path], target: Target | BoardOfCorners, failures: list[str], doubtful: list[str], report: Report
-) -> Views:
-    """The pictures that show enough of the target; `failures` grows by a line for each other one, `doubtful` by the
-    names of those that noise does not describe."""
-    found: list[tuple[Float, Float]] = []
-    size: tuple[int, int] | None = None
-    for number, path in enumerate(images, 1):
-        try:
-            pixels = read_image(path)
-            *points, is_doubtful = look(pixels, target)
-        except DetectionError as error:
-            failures.append(f"{path.name}: {error}")
-            continue
-        finally:
-            report(number, path.name)
-        shape = (pixels.shape[1], pixels.shape[0])
-        if size not in (None, shape):
-            raise CalibrationError(f"{path}: the picture has {shape[0]} x {shape[1]} pixels, those before it {size}")
-        size = shape
-        count = np.count_nonzero(np.isfinite(points[0][:, 0]))
-        if count < LEAST_MARKERS:
-            failures.append(f"{path.name}: {count} markers, {LEAST_MARKERS} are needed")
-            continue
-        if is_doubtful:
-            doubtful.append(path.name)
-        found.append((points[0], points[1]))
-    if size is None:
-        raise CalibrationError(failures[0] if failures else "there are no pictures")
-    centres = np.array([centres for centres, _ in found]).reshape(-1, target.count, 2)
-    covariances = np.array([covariance for _, covariance in found]).reshape(-1, target.count, 2, 2)
-    return Views(centres, covariances, size)

@@ -9,25 +9,18 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from compensation.calibration.board import board_of, board_of_corners
 from compensation.calibration.exports import EXPORTS, write_exports
-from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.rig import RigCalibration, calibrate_rig
-from compensation.calibration.views import LEAST_MARKERS, Views
-from compensation.commands.photographs_cli import described, look
+from compensation.commands.options import MegapixelsOption, say_left_out
+from compensation.commands.photographs_cli import described, known_board, views_of
 from foundation.command_app import App
-from foundation.errors import CalibrationError, ConfigError
+from foundation.errors import ConfigError
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable, make_folder, write_whole
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
-from foundation.output import say, show
+from foundation.output import show
 from foundation.progress import Report, progress
-from markers.corner_board import BoardOfCorners
-from markers.detection import DetectionError
-from markers.detections_table import doubt
-from markers.image_file import read_image
-from markers.target import Target
 
 app = App()
 
@@ -44,9 +37,7 @@ def calibrate_rig_command(
     export: Annotated[
         Path, typer.Option(help="A folder, new or not: rig.json, and a folder of files for each camera.")
     ],
-    max_megapixels: Annotated[
-        float, typer.Option("--max-megapixels", min=0.001, max=2000.0, help="Larger images are refused, unread.")
-    ] = GREATEST_MEGAPIXELS,
+    max_megapixels: MegapixelsOption = GREATEST_MEGAPIXELS,
 ) -> None:
     """Calibrate cameras that are fixed to each other: lenses, and each camera's pose against the first one.
 
@@ -68,16 +59,12 @@ def calibrate_rig_command(
         doubtful: list[str] = []
         with progress("find markers", len(folders) * len(names)) as report:
             seen = [
-                _seen(folder, names, board, failures, doubtful, _after(report, number * len(names)))
+                views_of(_pictures(folder, names), board, failures, doubtful, _after(report, number * len(names)))
                 for number, folder in enumerate(folders)
             ]
-        for failure in failures:
-            say(f"not used: {failure}")
-        if doubtful:
-            say(doubt(len(doubtful)))
-        useful = np.any([views.seen.sum(axis=1) >= LEAST_MARKERS for views in seen], axis=0)
-        cameras = [views.part(useful) for views in seen]
-        found = calibrate_rig(cameras, board_of(board) if isinstance(board, Target) else board_of_corners(board))
+        say_left_out("not used:", failures, doubtful)
+        useful = np.any([views.seen.any(axis=1) for views in seen], axis=0)
+        found = calibrate_rig([views.part(useful) for views in seen], known_board(board))
         data = _written(found, folders, export)
         lines = [
             f"{np.count_nonzero(useful)} moments, {len(folders)} cameras",
@@ -105,41 +92,9 @@ def _after(report: Report, before: int) -> Report:
     return later
 
 
-def _seen(
-    folder: Path,
-    names: list[str],
-    board: Target | BoardOfCorners,
-    failures: list[str],
-    doubtful: list[str],
-    report: Report,
-) -> Views:
-    """What a camera sees at each moment, NaN where it does not see enough; `failures` grows by a line for each picture
-    that is not used."""
-    centres: Float = np.full((len(names), board.count, 2), np.nan)
-    covariances: Float = np.full((len(names), board.count, 2, 2), np.nan)
-    size: tuple[int, int] | None = None
-    for number, name in enumerate(names):
-        path = folder / name
-        report(number, name)
-        if not path.exists():
-            continue
-        try:
-            pixels = read_image(path)
-            found, covariance, is_doubtful = look(pixels, board)
-        except DetectionError as error:
-            failures.append(f"{folder.name}/{name}: {error}")
-            continue
-        shape = (pixels.shape[1], pixels.shape[0])
-        if size not in (None, shape):
-            raise CalibrationError(f"{path}: the picture has {shape[0]} x {shape[1]} pixels, those before it {size}")
-        size = shape
-        if is_doubtful:
-            doubtful.append(f"{folder.name}/{name}")
-        if np.count_nonzero(np.isfinite(found[:, 0])) >= LEAST_MARKERS:
-            centres[number], covariances[number] = found, covariance
-    if size is None:
-        raise CalibrationError(f"{folder}: the target is in none of the pictures")
-    return Views(centres, covariances, size)
+def _pictures(folder: Path, names: list[str]) -> list[tuple[Path | None, str]]:
+    """Of each moment, None where the folder has none."""
+    return [(folder / name if (folder / name).exists() else None, f"{folder.name}/{name}") for name in names]
 
 
 def _written(found: RigCalibration, folders: list[Path], export: Path) -> list[dict[str, object]]:

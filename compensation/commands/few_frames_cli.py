@@ -1,4 +1,4 @@
-"""`compensate anchor`: a drift model for a session in which the target, or the camera, was put back in place."""
+"""`compensate anchor` and `fit-like`: a drift model from few frames, and what other nights or units have shown."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import typer
 from compensation.commands.options import CameraName, Finding
 from compensation.drift.anchoring import anchored, thermal_of
 from compensation.drift.model_file import load_model, save_model
+from compensation.drift.thermal_model import ThermalModel
+from compensation.drift.type_prior import fit_like as fit_like_units
 from foundation.command_app import App
 from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
@@ -38,5 +40,31 @@ def anchor(
         check_writable(out)
         known = thermal_of(load_model(model))
         found = anchored(known, finding.observed([session], camera))
-        save_model(found, out)
-        show({"model": out, "form": found.form, "title": found.title}, [f"{found.form}: {found.title}"])
+        _save(found, out)
+
+
+@app.command("fit-like")
+def fit_like(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Of the new unit, at two temperatures or more.")],
+    units: Annotated[list[Path], typer.Argument(metavar="MODEL...", help="Of three other units or more of its type.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
+    camera: CameraName = None,
+    *,
+    finding: Finding,
+) -> None:
+    """Fit the drift model of a new unit of a camera type to few frames, with what other units of the type have shown.
+
+    A warm-up, the reference and a set-point on each side of it, 14 and 45 degC say, teach more than a hot one alone.
+
+    Example: compensate fit-like sessions/20260108T180000Z-short unit-1.json unit-2.json unit-3.json -o unit-4.json
+    """
+    with one_line_errors():
+        check_writable(out)
+        known = [thermal_of(load_model(path)) for path in units]
+        found = fit_like_units(finding.observed([session], camera), known)
+        _save(found, out)
+
+
+def _save(found: ThermalModel, out: Path) -> None:
+    save_model(found, out)
+    show({"model": out, "form": found.form, "title": found.title}, [f"{found.form}: {found.title}"])
