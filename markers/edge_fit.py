@@ -101,8 +101,9 @@ def fit_edges(
         np.empty((count, 2, 2)),
         np.empty(count, np.uint8),
     )
+    # A copy of `reach`: read-only memory would be another type to the compiler.
     _fit_all(
-        image, parameters, start.scale_px, np.asarray(reach, np.float64),
+        image, parameters, start.scale_px, np.array(reach, np.float64),
         (noise.floor_DN2, noise.slope_DN), image.full_scale_DN - 1, empty_pixels(room(image, start, band_sigma)),
         band_sigma, max(1, count // sampled),
         covariance, quality, scatter, flags,

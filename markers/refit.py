@@ -51,8 +51,9 @@ def refit_edges(
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
     covariance, chi = np.empty((count, 2, 2)), np.empty(count)
+    # A copy of `reach`: read-only memory would be another type to the compiler.
     _refit_all(
-        image, parameters, start.scale_px, np.asarray(reach, np.float64), 1 / spread**2,
+        image, parameters, start.scale_px, np.array(reach, np.float64), 1 / spread**2,
         (noise.floor_DN2, noise.slope_DN), image.full_scale_DN - 1, empty_pixels(room(image, start, band_sigma)),
         _GREATEST_MISFIT * max(patience, 1.0), band_sigma, covariance, chi,
     )  # fmt: skip

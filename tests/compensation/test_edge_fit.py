@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from markers import edge_fit
 from markers.edge_fit import EdgeFit, Flag, fit_edges
 from markers.edge_model import (
     B0,
@@ -81,6 +82,18 @@ def test_the_normal_distribution_and_its_density_are_right_to_2e_7():
         step, density = normal_distribution(t)
         assert step == pytest.approx(0.5 * math.erfc(-t / math.sqrt(2)), abs=2e-7)
         assert density == pytest.approx(math.exp(-t * t / 2) / math.sqrt(2 * math.pi), abs=2e-7)
+
+
+def test_one_machine_code_fits_whatever_memory_the_reach_lies_in():
+    """Another one would be compiled first, for a quarter of a minute."""
+    scene = Scene(columns=3, rows=3, size=(300, 300))
+    start, image = start_from(scene, 0.3), picture_of(np.zeros((300, 300), np.uint8))
+    reach = np.tile([0.0, 2.3], (9, 1))
+    fit_edges(image, start, Noise(1.0, 0.1), reach)
+    reach.flags.writeable = False
+    fit_edges(image, start, Noise(1.0, 0.1), reach)
+    fit_edges(image, start, Noise(1.0, 0.1), np.tile([0, 2], (9, 1)))
+    assert len(edge_fit._fit_all.signatures) == 1
 
 
 def test_the_reference_renderer_puts_the_centroid_where_the_truth_says():
