@@ -36,7 +36,6 @@ from compensation.one_camera import name_of, own_frames, take
 from experiments.steps import Role
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, whole_file
 from foundation.output import say, show
 from foundation.progress import progress
@@ -82,27 +81,26 @@ def apply_model(
 
     Example: compensate apply model.json markers.csv --session sessions/20260101T180000Z-thermal-cycle -o corrected.csv
     """
-    with one_line_errors():
-        used = load_model(model)
-        if source.is_dir():
-            own = "a session has temperatures of its own"
-            _refuse(("--session", session), ("--camera-degC", camera_degC), ("--time", time), why=own)
-            _correct_session(used, _opened(source, used, camera, incomplete), out, frames, form)
-        elif source.suffix.lower() == ".csv":
-            _refuse(("--frames", frames), why="it selects frames of a session")
-            _refuse(("--time", time), why="the points have a column time_ns")
-            check_writable(out)
-            recorded = None if session is None else _opened(session, used, camera, incomplete)
-            used = _correct_points(used, source, out, recorded, camera_degC)
-        else:
-            _refuse(("--frames", frames), why="it selects frames of a session")
-            recorded = None if session is None else _opened(session, used, camera, incomplete)
-            used, states = _of_image(used, source, recorded, time, camera_degC)
-            check_writable(out)
-            image = read_image(source)
-            write_image(out, corrected_image(image, used, states), form, image.dtype)
-            _warn(middle_flags(used, states))
-        show({"out": out, "form": used.form}, ())
+    used = load_model(model)
+    if source.is_dir():
+        own = "a session has temperatures of its own"
+        _refuse(("--session", session), ("--camera-degC", camera_degC), ("--time", time), why=own)
+        _correct_session(used, _opened(source, used, camera, incomplete), out, frames, form)
+    elif source.suffix.lower() == ".csv":
+        _refuse(("--frames", frames), why="it selects frames of a session")
+        _refuse(("--time", time), why="the points have a column time_ns")
+        check_writable(out)
+        recorded = None if session is None else _opened(session, used, camera, incomplete)
+        used = _correct_points(used, source, out, recorded, camera_degC)
+    else:
+        _refuse(("--frames", frames), why="it selects frames of a session")
+        recorded = None if session is None else _opened(session, used, camera, incomplete)
+        used, states = _of_image(used, source, recorded, time, camera_degC)
+        check_writable(out)
+        image = read_image(source)
+        write_image(out, corrected_image(image, used, states), form, image.dtype)
+        _warn(middle_flags(used, states))
+    show({"out": out, "form": used.form}, ())
 
 
 def _opened(path: Path, model: DriftModel, camera: str | None, incomplete: bool) -> Session:
@@ -174,14 +172,13 @@ def export_model(
 
     Example: compensate export model.json -o runtime --c drift.h
     """
-    with one_line_errors():
-        if out is None and c is None and ros2 is None:
-            raise ConfigError("nothing to write: give -o FOLDER for Python, --c FILE.h for C, --ros2 FOLDER for ROS 2")
-        used = load_model(model)
-        written = [] if out is None else [*export(used, out)]
-        written += [] if c is None else [export_c(used, c)]
-        written += [] if ros2 is None else [*export_ros2(used, ros2)]
-        show(written, written)
+    if out is None and c is None and ros2 is None:
+        raise ConfigError("nothing to write: give -o FOLDER for Python, --c FILE.h for C, --ros2 FOLDER for ROS 2")
+    used = load_model(model)
+    written = [] if out is None else [*export(used, out)]
+    written += [] if c is None else [export_c(used, c)]
+    written += [] if ros2 is None else [*export_ros2(used, ros2)]
+    show(written, written)
 
 
 def _refuse(*options: tuple[str, object], why: str) -> None:

@@ -14,7 +14,6 @@ from compensation.commands.options import CameraName, Incomplete, TargetOption, 
 from compensation.observations import session_target
 from compensation.one_camera import take
 from foundation.command_app import App
-from foundation.exit_codes import one_line_errors
 from foundation.output import show
 from markers.target import Target
 from recording.reading.session import Session
@@ -34,11 +33,10 @@ def budget_of_session(
 
     Example: compensate budget sessions/20260101T180000Z-validation --geometry my-stand.yaml
     """
-    with one_line_errors():
-        stand = load_geometry(geometry)
-        recorded = open_session(session, camera, incomplete)
-        found = budget(recorded, named_target(target) or session_target(recorded), stand)
-        show(found, [table(found)])
+    stand = load_geometry(geometry)
+    recorded = open_session(session, camera, incomplete)
+    found = budget(recorded, named_target(target) or session_target(recorded), stand)
+    show(found, [table(found)])
 
 
 def budgets_of_sessions(

@@ -19,7 +19,6 @@ from compensation.observations import session_target
 from compensation.one_camera import serial_of
 from compensation.reporting.calibration_report import report_page
 from foundation.command_app import App
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable, check_writable, write_whole
 from foundation.output import show
 from foundation.progress import progress
@@ -58,25 +57,24 @@ def calibrate_session(
 
     Example: compensate calibrate sessions/20260101T180000Z-calibration -o camera.json --export exports
     """
-    with one_line_errors():
-        for path in (out, report):
-            if path is not None:
-                check_writable(path)
-        if export is not None:
-            check_folder_writable(export, EXPORTS)
-        opened = open_session(session, camera, incomplete)
-        used = named_target(target) or session_target(opened)
-        sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)
-        with progress("find markers", opened.frame_count) as shown:
-            positions = observe_positions(opened, used, shown)
-        found = calibrate(positions, used, sigma, model)
-        file = _file(opened, used.name, found)
-        file.save(out)
-        if export is not None:
-            write_exports(export, file.lens, file.camera_serial or "camera", file.fit.rms_px)
-        if report is not None:
-            write_whole(report, report_page(file, found))
-        show(file.model_dump(mode="json"), [summary(file, used)])
+    for path in (out, report):
+        if path is not None:
+            check_writable(path)
+    if export is not None:
+        check_folder_writable(export, EXPORTS)
+    opened = open_session(session, camera, incomplete)
+    used = named_target(target) or session_target(opened)
+    sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)
+    with progress("find markers", opened.frame_count) as shown:
+        positions = observe_positions(opened, used, shown)
+    found = calibrate(positions, used, sigma, model)
+    file = _file(opened, used.name, found)
+    file.save(out)
+    if export is not None:
+        write_exports(export, file.lens, file.camera_serial or "camera", file.fit.rms_px)
+    if report is not None:
+        write_whole(report, report_page(file, found))
+    show(file.model_dump(mode="json"), [summary(file, used)])
 
 
 def summary(file: CameraFile, target: Target) -> str:

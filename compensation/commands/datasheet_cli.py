@@ -17,7 +17,6 @@ from compensation.reporting.equipment import equipment_of
 from compensation.reporting.pdf import pdf_of
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, write_whole, write_whole_bytes
 from foundation.output import show
 from recording.reading.session import Session
@@ -42,21 +41,20 @@ def write_datasheet(
 
     Example: compensate datasheet sessions/20260101T180000Z-thermal-cycle -o camera.pdf
     """
-    with one_line_errors():
-        if out.suffix.lower() not in _FORMATS:
-            raise ConfigError(f"{out}: give a name that ends in {', '.join(_FORMATS)}")
-        check_writable(out)
-        stated = load_details(details)
-        given = None if model is None else load_model(model)
-        observations = finding.observed(sessions, camera)
-        sheet = datasheet(observations, given or fit(observations), stated)
-        equipment = equipment_of(Session.open(sessions[0]))
-        if out.suffix.lower() == ".json":
-            write_whole(out, datasheet_json(sheet, equipment))
-        elif out.suffix.lower() == ".pdf":
-            write_whole_bytes(out, pdf_of(datasheet_page(sheet, equipment)))
-        else:
-            write_whole(out, datasheet_page(sheet, equipment))
-        known = sum(one.value == one.value for one in sheet.quantities)
-        line = f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)"
-        show({"file": out, "quantities": sheet.quantities}, [line])
+    if out.suffix.lower() not in _FORMATS:
+        raise ConfigError(f"{out}: give a name that ends in {', '.join(_FORMATS)}")
+    check_writable(out)
+    stated = load_details(details)
+    given = None if model is None else load_model(model)
+    observations = finding.observed(sessions, camera)
+    sheet = datasheet(observations, given or fit(observations), stated)
+    equipment = equipment_of(Session.open(sessions[0]))
+    if out.suffix.lower() == ".json":
+        write_whole(out, datasheet_json(sheet, equipment))
+    elif out.suffix.lower() == ".pdf":
+        write_whole_bytes(out, pdf_of(datasheet_page(sheet, equipment)))
+    else:
+        write_whole(out, datasheet_page(sheet, equipment))
+    known = sum(one.value == one.value for one in sheet.quantities)
+    line = f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)"
+    show({"file": out, "quantities": sheet.quantities}, [line])

@@ -20,7 +20,6 @@ from compensation.commands.options import (
 from compensation.observations import read_frames, session_target
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.output import show
@@ -53,7 +52,7 @@ def detect_images(
 
     Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
     """
-    with one_line_errors(), images_up_to(max_megapixels):
+    with images_up_to(max_megapixels):
         check_writable(out)
         opened = [_open(path, incomplete) for path in sources]
         chosen = _detection_target(opened, target)

@@ -13,7 +13,6 @@ from compensation.drift.model_file import load_model, save_model
 from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.type_prior import fit_like as fit_like_units
 from foundation.command_app import App
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
 from foundation.output import show
 
@@ -36,11 +35,10 @@ def anchor(
 
     Example: compensate anchor model.json sessions/20260108T180000Z-short -o model-of-the-8th.json
     """
-    with one_line_errors():
-        check_writable(out)
-        known = thermal_of(load_model(model))
-        found = anchored(known, finding.observed([session], camera))
-        _save(found, out)
+    check_writable(out)
+    known = thermal_of(load_model(model))
+    found = anchored(known, finding.observed([session], camera))
+    _save(found, out)
 
 
 @app.command("fit-like")
@@ -58,11 +56,10 @@ def fit_like(
 
     Example: compensate fit-like sessions/20260108T180000Z-short unit-1.json unit-2.json unit-3.json -o unit-4.json
     """
-    with one_line_errors():
-        check_writable(out)
-        known = [thermal_of(load_model(path)) for path in units]
-        found = fit_like_units(finding.observed([session], camera), known)
-        _save(found, out)
+    check_writable(out)
+    known = [thermal_of(load_model(path)) for path in units]
+    found = fit_like_units(finding.observed([session], camera), known)
+    _save(found, out)
 
 
 def _save(found: ThermalModel, out: Path) -> None:

@@ -35,7 +35,6 @@ from compensation.reporting.table_positions import table_positions
 from compensation.validation3d.document import load_validation
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable
 from foundation.output import say, show
 from recording.reading.session import Session
@@ -76,26 +75,25 @@ def fit(
 
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
-    with one_line_errors():
-        check_request(degree, form)
-        check_writable(out)
-        if any(path.suffix.lower() == ".csv" for path in sessions):
-            observations = _of_table(sessions)
-        else:
-            observations = finding.observed(sessions, camera)
-        model = fit_model(observations, degree, form, say)
-        evaluation = evaluate(model, observations)
-        save_model(model, out)
-        bumps = list(model.facts.bumps)
-        unrepeated = find_unrepeated(observations, model.facts.bumps)
-        named = [one for one in unrepeated if one.cause is not Cause.NOTHING]
-        data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
-        stepped = [_bump_line(each, observations) for each in bumps]
-        stepped += [f"{one.session_id}: {one.text}" for one in named]
-        repeats = model.between_nights if isinstance(model, ThermalModel) else None
-        stepped += [] if repeats is None else [repeats.text]
-        lines = [f"{model.form}: {model.title}", *stepped, table(evaluation)]
-        show({**data, "unrepeated": named, "between_nights": repeats, **_scores(evaluation)}, lines)
+    check_request(degree, form)
+    check_writable(out)
+    if any(path.suffix.lower() == ".csv" for path in sessions):
+        observations = _of_table(sessions)
+    else:
+        observations = finding.observed(sessions, camera)
+    model = fit_model(observations, degree, form, say)
+    evaluation = evaluate(model, observations)
+    save_model(model, out)
+    bumps = list(model.facts.bumps)
+    unrepeated = find_unrepeated(observations, model.facts.bumps)
+    named = [one for one in unrepeated if one.cause is not Cause.NOTHING]
+    data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
+    stepped = [_bump_line(each, observations) for each in bumps]
+    stepped += [f"{one.session_id}: {one.text}" for one in named]
+    repeats = model.between_nights if isinstance(model, ThermalModel) else None
+    stepped += [] if repeats is None else [repeats.text]
+    lines = [f"{model.form}: {model.title}", *stepped, table(evaluation)]
+    show({**data, "unrepeated": named, "between_nights": repeats, **_scores(evaluation)}, lines)
 
 
 def _bump_line(bump: Bump, observations: Observations) -> str:
@@ -160,23 +158,22 @@ def report(
 
     Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
     """
-    with one_line_errors():
-        check_report_writable(out, model, validation)
-        given, extras = (
-            model and load_model(model),
-            _extras(sessions, camera, budget, finding.target, validation, details),
-        )
-        observations = finding.observed(sessions, camera)
-        with drawing(finding.workers) as draw:
-            if given is None:
-                used, evaluation, refusal = fitted(observations)
-            else:
-                used, refusal = given, ""
-                evaluation = evaluate(given, observations) if can_be_scored(observations) else None
-            write_report(out, observations, used, evaluation, extras, draw)
-        if refusal:
-            raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
-        alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
-        scores = {} if evaluation is None else _scores(evaluation)
-        lines = [alone if evaluation is None else table(evaluation)]
-        show({"report": out, "numbers": numbers_path(out), **scores}, lines)
+    check_report_writable(out, model, validation)
+    given, extras = (
+        model and load_model(model),
+        _extras(sessions, camera, budget, finding.target, validation, details),
+    )
+    observations = finding.observed(sessions, camera)
+    with drawing(finding.workers) as draw:
+        if given is None:
+            used, evaluation, refusal = fitted(observations)
+        else:
+            used, refusal = given, ""
+            evaluation = evaluate(given, observations) if can_be_scored(observations) else None
+        write_report(out, observations, used, evaluation, extras, draw)
+    if refusal:
+        raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
+    alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
+    scores = {} if evaluation is None else _scores(evaluation)
+    lines = [alone if evaluation is None else table(evaluation)]
+    show({"report": out, "numbers": numbers_path(out), **scores}, lines)

@@ -18,7 +18,6 @@ from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views
 from compensation.commands.options import MegapixelsOption, installed_target, say_left_out
 from foundation.command_app import App
 from foundation.errors import CalibrationError
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.output import show
@@ -55,7 +54,7 @@ def calibrate_photographs(
 
     Example: compensate calibrate-photographs photos/*.jpg --target my-target.yaml --export exports
     """
-    with one_line_errors(), images_up_to(max_megapixels):
+    with images_up_to(max_megapixels):
         check_folder_writable(export, EXPORTS)
         board = described(target)
         failures: list[str] = []

@@ -16,7 +16,6 @@ from compensation.commands.options import MegapixelsOption, say_left_out
 from compensation.commands.photographs_cli import described, known_board, views_of
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_folder_writable, make_folder, write_whole
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.output import show
@@ -47,7 +46,7 @@ def calibrate_rig_command(
 
     Example: compensate calibrate-rig left right --target my-target.yaml --export rig
     """
-    with one_line_errors(), images_up_to(max_megapixels):
+    with images_up_to(max_megapixels):
         if len(folders) < 2 or len({folder.name for folder in folders}) < len(folders):
             raise ConfigError("a rig has two or more cameras, each with a folder of another name")
         check_folder_writable(export, [RIG])

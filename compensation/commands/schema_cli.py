@@ -13,7 +13,6 @@ from pydantic import BaseModel
 from compensation.budget.geometry import Geometry
 from compensation.datasheet.details import Details
 from foundation.command_app import App
-from foundation.exit_codes import one_line_errors
 from foundation.output import show
 from foundation.schemas import write_schemas
 
@@ -33,7 +32,6 @@ def schema(
 
     Example: compensate schema --out schema
     """
-    with one_line_errors():
-        installed = Path(str(importlib.resources.files("configs"))) / "schema"
-        written = list(write_schemas(out or installed, DOCUMENTS))
-        show(written, written)
+    installed = Path(str(importlib.resources.files("configs"))) / "schema"
+    written = list(write_schemas(out or installed, DOCUMENTS))
+    show(written, written)

@@ -22,7 +22,6 @@ from compensation.validation3d.validation_frames import validation_frames
 from compensation.validation3d.validation_text import summary
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
 from foundation.files import check_writable, write_whole
 from foundation.output import show
 from recording.reading.session import Session
@@ -52,24 +51,23 @@ def validate_session(
     Example: compensate validate sessions/20260101T180000Z-validation --camera camera.json --model model.json
     -o validation.html
     """
-    with one_line_errors():
-        beside = _numbers_beside(out)
-        file, drift = CameraFile.load(camera), load_model(model)
-        geometry = None if budget is None else load_geometry(budget)
-        opened = Session.open(session)
-        observations = finding.observed([session], name_of(opened, file.camera_serial))
-        check_same(observations, file, drift)
-        frames = validation_frames(opened, observations)
+    beside = _numbers_beside(out)
+    file, drift = CameraFile.load(camera), load_model(model)
+    geometry = None if budget is None else load_geometry(budget)
+    opened = Session.open(session)
+    observations = finding.observed([session], name_of(opened, file.camera_serial))
+    check_same(observations, file, drift)
+    frames = validation_frames(opened, observations)
 
-        def stand_at(distances_mm: Float) -> StandPart | None:
-            if geometry is None:
-                return None
-            return stand_part(opened, observations, frames, geometry, distances_mm)
+    def stand_at(distances_mm: Float) -> StandPart | None:
+        if geometry is None:
+            return None
+        return stand_part(opened, observations, frames, geometry, distances_mm)
 
-        found = validate(observations, frames, camera_of(file, lens), drift, stand_at)
-        write_whole(out, validation_page(found))
-        write_whole(beside, as_json(found))
-        show(json.loads(as_json(found)), [summary(found)])
+    found = validate(observations, frames, camera_of(file, lens), drift, stand_at)
+    write_whole(out, validation_page(found))
+    write_whole(beside, as_json(found))
+    show(json.loads(as_json(found)), [summary(found)])
 
 
 def _numbers_beside(page: Path) -> Path:
