@@ -3,6 +3,7 @@
 import itertools
 import os
 import socket
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,13 @@ def camera_address() -> str:
     """An address of 127.0.0.0/8 that this process has not given to a camera for a long time: the port of GVCP is fixed,
     and a laboratory whose daemon was killed keeps its own for a minute."""
     return f"127.{1 + os.getpid() // 250 % 60}.{1 + os.getpid() % 250}.{1 + next(_cameras) % 254}"
+
+
+@cache
+def usual_camera_address() -> str:
+    """The address of the cameras that this process makes one after the other. For tests, not for their modules: these
+    are imported once for all workers."""
+    return camera_address()
 
 
 def move_to_free(stand: dict[str, Any], folder: Path) -> dict[str, Any]:

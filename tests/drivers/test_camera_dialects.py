@@ -28,7 +28,7 @@ from drivers.wires.camera_temperature import NoTemperature, find_temperature
 from foundation.clock import WallClock
 from foundation.errors import ConfigError, Refused
 from foundation.readings import Quality
-from tests.addresses import camera_address
+from tests.addresses import usual_camera_address
 from tests.dialects import (
     DIALECTS,
     EXPOSURE,
@@ -49,7 +49,6 @@ from tests.system.conftest import require_aravis
 
 BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16, "Mono10Packed": 10, "Mono12Packed": 12}
 BITS |= {"Mono10p": 10, "Mono12p": 12}
-ADDRESS = camera_address()
 FOLDER = os.environ.get("GENICAM", "")
 
 
@@ -75,7 +74,15 @@ def dressed(file: GenicamFile | None, size_px: tuple[int, int] = (WIDTH, HEIGHT)
         return scene(rows, size_px[0])
 
     camera = FakeCamera(
-        Plant(), WallClock(), render, ADDRESS, "SN1", size_px=size_px, real_time=True, boot_s=0, genicam=file
+        Plant(),
+        WallClock(),
+        render,
+        usual_camera_address(),
+        "SN1",
+        size_px=size_px,
+        real_time=True,
+        boot_s=0,
+        genicam=file,
     )
     camera.start()
     try:
@@ -86,7 +93,7 @@ def dressed(file: GenicamFile | None, size_px: tuple[int, int] = (WIDTH, HEIGHT)
 
 @asynccontextmanager
 async def opened(**changes: object):
-    usual = {"address": ADDRESS, "exposure_s": 0.01, "packet_size": 1500}
+    usual = {"address": usual_camera_address(), "exposure_s": 0.01, "packet_size": 1500}
     camera = Camera("eye", GigeCameraSettings.model_validate({**usual, **changes}), WallClock())
     try:
         await camera.open()

@@ -22,9 +22,8 @@ from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock, seconds_ns
 from foundation.errors import DeviceFault, Refused, StandError, Unreachable
 from foundation.readings import Quality
-from tests.addresses import camera_address
+from tests.addresses import usual_camera_address
 
-ADDRESS = camera_address()
 SERIAL = "C0061"
 WIDTH_px, HEIGHT_px = 640, 480
 START_NS = 1_700_000_000 * NS_PER_S
@@ -70,7 +69,14 @@ def noise(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT_px
 def simulated(clock: WallClock | FollowedClock, plant: WarmPlant, serial: str = SERIAL) -> Generator[FakeCamera]:
     real_time = isinstance(clock, WallClock)
     fake = FakeCamera(
-        plant, clock, noise, ADDRESS, serial, size_px=(WIDTH_px, HEIGHT_px), real_time=real_time, boot_s=0.2
+        plant,
+        clock,
+        noise,
+        usual_camera_address(),
+        serial,
+        size_px=(WIDTH_px, HEIGHT_px),
+        real_time=real_time,
+        boot_s=0.2,
     )
     fake.start()
     try:
@@ -93,7 +99,7 @@ def fake(plant: WarmPlant) -> Iterator[FakeCamera]:
 
 def settings(**changes: object) -> GigeCameraSettings:
     usual: dict[str, object] = {"serial_number": SERIAL, "exposure_s": EXPOSURE_S, "heartbeat_s": 1.5}
-    return GigeCameraSettings.model_validate({"address": ADDRESS, **usual, **changes})
+    return GigeCameraSettings.model_validate({"address": usual_camera_address(), **usual, **changes})
 
 
 @asynccontextmanager
@@ -447,19 +453,19 @@ async def test_while_another_client_controls_the_camera_open_is_refused():
         await other.close()
 
 
-CRASH = f"""
-import asyncio, os
+CRASH = """
+import asyncio, os, sys
 from drivers.devices.cameras.camera_gige import Camera
 from drivers.wires.camera_settings import GigeCameraSettings
 from foundation.clock import WallClock
-asyncio.run(Camera("camera", GigeCameraSettings(address="{ADDRESS}", heartbeat_s=1.5), WallClock()).open())
+asyncio.run(Camera("camera", GigeCameraSettings(address=sys.argv[1], heartbeat_s=1.5), WallClock()).open())
 os._exit(0)
 """
 
 
 @pytest.mark.usefixtures("fake")
 async def test_after_a_crash_of_our_own_open_waits_for_the_heartbeat():
-    process = await asyncio.to_thread(subprocess.run, [sys.executable, "-c", CRASH], check=True)
+    process = await asyncio.to_thread(subprocess.run, [sys.executable, "-c", CRASH, usual_camera_address()], check=True)
     assert process.returncode == 0
     async with opened() as camera:
         await camera.grab()
