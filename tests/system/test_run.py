@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.clock import seconds_ns
+from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError, SessionError, StandError, StandTripped, Unreachable
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
@@ -185,11 +185,12 @@ async def test_a_dead_daemon_does_not_heat(tmp_path: Path, order: Callable[..., 
         before, earlier = await control.request({"do": "state"}), before
     assert before["heater_enabled"] == 1
     assert isinstance(before["now_ns"], int)
-    await control.advance(before["now_ns"] + seconds_ns(ordered.config.guard.heater_hold_s))
+    off_ns = before["now_ns"] + seconds_ns(ordered.config.guard.heater_hold_s + 1)
+    await control.advance(off_ns)  # a second later: what was on the wire arrives when time goes on
     after = await control.request({"do": "state"})
     assert after["heater_enabled"] == 0
     assert after["compressor_on"] == 0
-    await control.advance(before["now_ns"] + seconds_ns(ordered.config.guard.heater_hold_s + 1))
+    await control.advance(off_ns + NS_PER_S)
     assert (await control.request({"do": "state"}))["heater_W"] == 0
     with contextlib.suppress(Unreachable):  # it may be gone before it has answered
         await control.request({"do": "quit"})
