@@ -197,6 +197,7 @@ class VirtualClock:
         self._sleepers: list[tuple[int, int, asyncio.Future[None]]] = []
         self._order = itertools.count()
         self._changed = asyncio.Event()
+        self._alone: asyncio.Task[None] | None = None
 
     def now_ns(self) -> int:
         """The present virtual instant."""
@@ -220,7 +221,8 @@ class VirtualClock:
             self._changed.set()
 
     async def run(self) -> None:
-        """Drive time until cancelled; run it as a task beside the tasks that sleep on this clock."""
+        """Drive time until cancelled; run it as a task beside the tasks that sleep on this clock. Raises what `advance`
+        raises; time goes on without it, since what ends a run sleeps, too."""
         while True:
             await self._rest()
             deadline_ns, _, future = heapq.heappop(self._sleepers)
@@ -228,8 +230,14 @@ class VirtualClock:
                 continue
             if deadline_ns > self._now_ns:
                 self._now_ns = deadline_ns
-                if self._advance is not None:
-                    await self._advance(deadline_ns)
+                try:
+                    if self._advance is not None:
+                        await self._advance(deadline_ns)
+                except Exception:
+                    heapq.heappush(self._sleepers, (deadline_ns, -1, future))
+                    self._advance = None
+                    self._alone = asyncio.create_task(self.run())
+                    raise
             if not future.done():
                 future.set_result(None)
 

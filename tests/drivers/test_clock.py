@@ -15,6 +15,7 @@ from foundation.clock import (
     boot_time_ns,
     seconds_ns,
 )
+from foundation.errors import Unreachable
 from tests.host import Host
 
 
@@ -247,3 +248,19 @@ def test_boot_time_is_that_of_the_kernel():
     before_ns = boot_time_ns()
     uptime_ns = seconds_ns(float(Path("/proc/uptime").read_text().split()[0]))
     assert before_ns - seconds_ns(0.011) <= uptime_ns <= boot_time_ns()  # which is given to 10 ms
+
+
+async def test_what_sleeps_is_woken_also_when_nobody_can_be_told_of_the_time():
+    """A run whose simulated laboratory has died ends, and what ends it sleeps."""
+
+    async def advance(time_ns: int) -> None:
+        raise Unreachable("simulator", "it is gone")
+
+    clock = VirtualClock(0, advance)
+    driver = asyncio.create_task(clock.run())
+    async with asyncio.timeout(10):
+        await clock.sleep_until(NS_PER_S)
+        await clock.sleep_until(2 * NS_PER_S)
+    assert clock.now_ns() == 2 * NS_PER_S
+    with pytest.raises(Unreachable, match="it is gone"):
+        await driver
