@@ -259,10 +259,19 @@ async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night
 
 async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):
     async with a_page(night.chromium, night.port, "queue") as page:
-        await page.get_by_label("recipe", exact=True).select_option("overnight")
         await page.get_by_text("Look at and change its parameters").click()
         frames = page.get_by_label("frames", exact=True).first
         assert await frames.input_value() == "3600"
+        answered = asyncio.Event()
+
+        async def late(route):
+            await answered.wait()
+            await route.continue_()
+
+        await page.route("**/recipes/overnight", late)
+        await page.get_by_label("recipe", exact=True).select_option("overnight")
+        assert await frames.is_disabled()  # what is typed now would be lost when the answer comes
+        answered.set()
         await frames.fill("120")
         await page.get_by_label("cameras", exact=True).first.fill("lens A, lens B")
         await page.get_by_role("button", name="Add to the queue").click()
@@ -334,6 +343,7 @@ async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(nigh
         assert broken == {"name": "flap.jam", "value": 1500, "for_s": 60.0, "mend": False}
         assert (mended["name"], mended["mend"]) == ("flap.jam", True)
         night.is_simulated = False
+        await page.locator("#simulated").wait_for(state="hidden")
     async with a_page(night.chromium, night.port, "devices") as page:
         await page.get_by_role("heading", name="What wears").wait_for()
         await page.get_by_role("button", name="Open", exact=True).wait_for()

@@ -17,8 +17,10 @@ export class Queue {
     this.attended = h("input", { type: "checkbox", id: "attended" });
     this.note = h("input", { type: "text", id: "note", maxlength: 4000, size: 40 });
     this.tags = h("input", { type: "text", id: "tags", maxlength: 300, size: 24, placeholder: "lens-a, after-service" });
-    this.details = h("details", {}, h("summary", {}, "Look at and change its parameters"));
+    this.parameters = h("fieldset", { class: "bare", disabled: true });
+    this.details = h("details", {}, h("summary", {}, "Look at and change its parameters"), this.parameters);
     this.start = h("button", { type: "submit", class: "main" }, "Add to the queue");
+    this.asked = 0;
     const form = h("form", { class: "fields", onsubmit: (event) => { event.preventDefault(); this.submit(); } },
       h("div", { class: "field" }, h("label", { for: "recipe" }, "recipe"), this.choice),
       this.about = h("p", { class: "quiet" }),
@@ -41,7 +43,7 @@ export class Queue {
       const [recipes, schema] = await Promise.all([get("/recipes"), get("/recipes/schema")]);
       if (this.closed) return;
       this.form = new RecipeForm(schema, axes_of(this.app.state));
-      this.details.append(this.form.element);
+      this.parameters.append(this.form.element);
       fill(this.choice, recipes.map(({ name }) => h("option", { value: name }, name)));
       this.choice.value = recipes.some(({ name }) => name === "overnight") ? "overnight" : recipes[0]?.name;
       await this.choose();
@@ -49,15 +51,17 @@ export class Queue {
   }
 
   async choose() {
-    const wanted = this.choice.value;
+    const wanted = this.choice.value, asked = ++this.asked;
+    this.parameters.disabled = this.start.disabled = true;  // what is changed now would be lost when the answer comes
     try {
       const recipe = await get(`/recipes/${encodeURIComponent(wanted)}`);
-      if (this.choice.value !== wanted) return;  // another was chosen meanwhile, whose answer may have come first
+      if (this.asked !== asked) return;  // it was chosen from again, and this answer may come last
       this.installed = wanted;
       this.about.textContent = recipe.description ?? "";
       this.form.load(recipe);
       this.unchanged = JSON.stringify(this.form.recipe());
-    } catch (error) { tell(this.form_answer, error.message, true); }
+      this.parameters.disabled = this.start.disabled = false;
+    } catch (error) { if (this.asked === asked) tell(this.form_answer, error.message, true); }
   }
 
   async submit() {
