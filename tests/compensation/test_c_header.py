@@ -72,6 +72,7 @@ def test_it_corrects_and_flags_as_the_module_at_every_instant(name: str, program
         np.testing.assert_allclose(one, other, rtol=0, atol=3e-4)  # of 640 in float32: 6e-5
 
 
+@pytest.mark.nightly
 def test_a_fitted_model_follows_a_whole_night_as_the_module_does(tmp_path: Path):
     made = night(drawn_camera(1003, "creep", "dead_zone"), full_night())
     model, history = fit(made.observed), made.observed.histories[0]

@@ -15,6 +15,7 @@ from compensation.cli import app
 from foundation.errors import ConfigError, DetectionError
 from markers.april_grid import AprilGrid
 from markers.corner_board import BoardOfCorners, CornerBoard, find_corners, load_corner_board
+from tests.nightly import by_night
 
 SIZE = (1224, 1024)
 MATRIX = np.array([[2000.0, 0, 611.5], [0, 2000.0, 511.5], [0, 0, 1]])
@@ -136,7 +137,7 @@ def test_files_that_say_their_kind_are_boards_of_squares_and_others_are_not(tmp_
     assert load_corner_board(path) is None
 
 
-@pytest.mark.parametrize("kind", ["charuco", "aprilgrid", pytest.param("checkerboard", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("kind", ["aprilgrid", by_night("charuco"), by_night("checkerboard")])
 def test_the_command_calibrates_from_corners(kind: str, tmp_path: Path):
     board = BOARDS[kind]
     described = tmp_path / "board.yaml"

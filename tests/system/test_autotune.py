@@ -11,6 +11,7 @@ from recording.reading.session import Session
 from stand.running.order import Order
 from stand.running.run import run_virtual
 from tests.asking import ask, ask_status
+from tests.nightly import by_night
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_guard_run import Watcher, check_safe
 from tests.system.test_run import at_step
@@ -33,7 +34,7 @@ async def operated(run: Coroutine[None, None, Path], operate: Coroutine[None, No
     return await running
 
 
-@pytest.mark.parametrize("step", ["Soak", "SetTemperature"])
+@pytest.mark.parametrize("step", ["Soak", by_night("SetTemperature")])
 async def test_autotuning_is_held_and_the_run_goes_on_after_clear(
     tmp_path: Path, order: Callable[..., Order], step: str
 ):
