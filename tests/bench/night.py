@@ -24,7 +24,7 @@ def figures(directory: Path) -> list[Figure]:
     progress(f"{REPEATS} runs of the protocol with brief dwells")
     brief = outcomes(simulated_order(directory, BRIEF_PROTOCOL, POLL_s), directory, REPEATS)
     same = sum(outcome.digest == brief[0].digest for outcome in brief)
-    progress("the whole protocol, about 80 s")
+    progress("the whole protocol, two to three minutes")
     (night,) = outcomes(simulated_order(directory, PROTOCOL, POLL_s), directory, 1)
     what = f"the paper's protocol, {night.simulated_s / 3600:.1f} h at 1 Hz"
     speed = f"{night.simulated_s / night.wall_s:.0f} x real time"
