@@ -1,4 +1,4 @@
-"""The one place that touches pymodbus: a blocking master, one request and its checked reply, failures as WireFaults.
+"""The one place that drives pymodbus: a blocking master, one request and its checked reply, failures as WireFaults.
 
 pymodbus changes its interface in minor releases, and polls a serial port in steps of four characters (5 ms at 9600
 baud); the subclasses here wait for the first byte instead and say why a port does not open.
@@ -19,24 +19,11 @@ import serial
 from pydantic import Field
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
-from pymodbus.pdu import DecodePDU, ModbusPDU
-from pymodbus.pdu.bit_message import (
-    ReadCoilsRequest,
-    ReadCoilsResponse,
-    ReadDiscreteInputsRequest,
-    ReadDiscreteInputsResponse,
-)
-from pymodbus.pdu.register_message import (
-    ReadHoldingRegistersRequest,
-    ReadHoldingRegistersResponse,
-    ReadInputRegistersRequest,
-    ReadInputRegistersResponse,
-    WriteMultipleRegistersRequest,
-    WriteMultipleRegistersResponse,
-    WriteSingleRegisterRequest,
-)
+from pymodbus.pdu import ModbusPDU
+from pymodbus.pdu.register_message import WriteMultipleRegistersRequest, WriteSingleRegisterRequest
 
 from drivers.wires.link import why_closed
+from drivers.wires.modbus_messages import READS, REPLIES, Decoder, WriteCoilWord
 from drivers.wires.registers import Space
 from foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of
 from foundation.documents import Document
@@ -44,12 +31,6 @@ from foundation.documents import Document
 # Every fault is raised and counted here; pymodbus would print it a second time on stderr.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
-READS: dict[Space, type[ModbusPDU]] = {
-    "holding": ReadHoldingRegistersRequest,
-    "input": ReadInputRegistersRequest,
-    "coil": ReadCoilsRequest,
-    "discrete": ReadDiscreteInputsRequest,
-}
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal address",
@@ -62,7 +43,6 @@ EXCEPTIONS = {
     11: "no answer behind the gateway",
 }
 _EXCEPTION = 0x80  # of the function in a reply
-_ADDRESS_AND_COUNT = 4  # bytes
 _HEAD = 7  # bytes before the function over TCP: number, protocol 0, length, unit
 UNANSWERED_EXCEPTIONS = frozenset({6, 10, 11})  # somebody answered, but not the unit, or not now
 
@@ -97,63 +77,6 @@ class WireFault(Exception):
         self.fault = fault
 
 
-class WriteCoilWord(ModbusPDU):
-    """FC 05 with any 16-bit value, as request and reply (pymodbus knows FF00 and 0000 only).
-
-    The Waveshare relay takes a time in the value (protocol V2, "flash on").
-    """
-
-    function_code = 5
-    rtu_frame_size = 8
-
-    def encode(self) -> bytes:
-        """Address and value, big endian."""
-        return struct.pack(">HH", self.address, self.registers[0])
-
-    def decode(self, data: bytes) -> None:
-        """The echo of address and value."""
-        self.address, value = struct.unpack(">HH", data[:4])
-        self.registers = [value]
-
-
-def _strict(reply: type[ModbusPDU]) -> type[ModbusPDU]:
-    """`reply` with a byte count that must be that of its data: pymodbus takes bits whatever it says, and registers with
-    one byte too many, one after the other."""
-    has_words = reply in (ReadHoldingRegistersResponse, ReadInputRegistersResponse)
-
-    def decode(self: ModbusPDU, data: bytes) -> None:
-        if data[0] != len(data) - 1:
-            raise ValueError(f"byte count {data[0]} before {len(data) - 1} bytes")
-        if has_words:
-            self.registers = list(struct.unpack(f">{data[0] // 2}H", data[1:]))  # struct.error with half a word
-        else:
-            reply.decode(self, data)
-
-    return type(reply.__name__, (reply,), {"decode": decode})
-
-
-class _RegistersWritten(WriteMultipleRegistersResponse):
-    """FC 16, whose reply is address and count and nothing else."""
-
-    def decode(self, data: bytes) -> None:
-        """ValueError when something follows."""
-        if len(data) != _ADDRESS_AND_COUNT:
-            raise ValueError(f"{len(data)} bytes of address and count")
-        super().decode(data)
-
-
-REPLIES = (
-    WriteCoilWord,
-    _RegistersWritten,
-    *map(
-        _strict,
-        (ReadCoilsResponse, ReadDiscreteInputsResponse, ReadHoldingRegistersResponse, ReadInputRegistersResponse),
-    ),
-)
-
-_REPLY_OF = {reply.function_code: reply for reply in REPLIES}
-
-
 class SerialClient(ModbusSerialClient):
     """pymodbus over pyserial, without its polling."""
 
@@ -179,22 +102,6 @@ class SerialClient(ModbusSerialClient):
             raise ConnectionException("port closed")
         first = self.socket.read(1)
         return first + self.socket.read(self.socket.in_waiting) if first else b""
-
-
-class _Decoder(DecodePDU):
-    """pymodbus' own, without its log: that writes each reply as text, also where nobody reads it."""
-
-    def decode(self, frame: bytes) -> ModbusPDU | None:
-        """A reply's message; None when it cannot be one."""
-        reply = _REPLY_OF.get(frame[0])
-        if reply is None:  # an exception, or nothing that was asked for
-            return super().decode(frame)
-        message = reply()
-        try:
-            message.decode(frame[1:])
-        except (ModbusException, ValueError, IndexError, struct.error):
-            return None
-        return message
 
 
 class TcpClient(ModbusTcpClient):
@@ -274,7 +181,7 @@ class ModbusClient:
         if self._client is not None:
             return
         client = self._make()
-        client.framer.decoder = _Decoder(is_server=False)
+        client.framer.decoder = Decoder(is_server=False)
         for reply in REPLIES:
             client.register(reply)
         try:
