@@ -81,3 +81,12 @@ async def bench_of(make: str, wire: str, folder: Path, **settings: object) -> As
     finally:
         await bench.driver.close()
         bench.line.close()
+
+
+@asynccontextmanager
+async def running_at_30_degC(make: str, folder: Path) -> AsyncGenerator[Any]:
+    async with bench_of(make, "tcp", folder) as bench:
+        await bench.driver.open()
+        await bench.driver.set_temperature(30.0)
+        await bench.driver.run()
+        yield bench

@@ -10,7 +10,7 @@ from drivers.devices.chambers.chamber_ascii2 import number, parse
 from drivers.devices.chambers.chamber_cts import framed, unframed
 from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 from foundation.readings import Quality
-from tests.drivers.chamber_bench import ALLOWED_DEGC, MAKES, ON_WIRES, WIRES, bench_of
+from tests.drivers.chamber_bench import ALLOWED_DEGC, MAKES, ON_WIRES, WIRES, bench_of, running_at_30_degC
 
 
 @pytest.mark.parametrize(("make", "wire"), ON_WIRES)
@@ -72,10 +72,7 @@ async def test_one_whose_connection_another_program_has_is_unreachable_and_back_
 
 @pytest.mark.parametrize("make", MAKES)
 async def test_one_that_restarted_stopped_is_reported_and_not_started_by_itself(make: str, tmp_path: Path):
-    async with bench_of(make, "tcp", tmp_path) as bench:
-        await bench.driver.open()
-        await bench.driver.set_temperature(30.0)
-        await bench.driver.run()
+    async with running_at_30_degC(make, tmp_path) as bench:
         bench.fake.restart()
         for _ in range(3):
             assert (await bench.read())["running"].value == 0
@@ -84,10 +81,7 @@ async def test_one_that_restarted_stopped_is_reported_and_not_started_by_itself(
 
 @pytest.mark.parametrize("make", MAKES)
 async def test_one_that_restarted_running_at_its_old_set_point_is_reported_and_left(make: str, tmp_path: Path):
-    async with bench_of(make, "tcp", tmp_path) as bench:
-        await bench.driver.open()
-        await bench.driver.set_temperature(30.0)
-        await bench.driver.run()
+    async with running_at_30_degC(make, tmp_path) as bench:
         bench.fake.restart(running_at_degC=55.0)
         for _ in range(2):
             found = await bench.read()

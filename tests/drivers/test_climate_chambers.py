@@ -8,7 +8,7 @@ import pytest
 
 from drivers.devices.chambers.chamber_simserv import reply_of
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused
-from tests.drivers.chamber_bench import MAKES, ON_WIRES, bench_of
+from tests.drivers.chamber_bench import MAKES, ON_WIRES, bench_of, running_at_30_degC
 
 
 @pytest.mark.parametrize(("make", "wire"), ON_WIRES)
@@ -69,10 +69,7 @@ async def test_a_panel_that_protects_is_reported_with_what_to_do_and_watched_all
 
 @pytest.mark.parametrize("make", MAKES)
 async def test_what_was_changed_at_the_panel_is_reported_with_both_values_and_left(make: str, tmp_path: Path):
-    async with bench_of(make, "tcp", tmp_path) as bench:
-        await bench.driver.open()
-        await bench.driver.set_temperature(30.0)
-        await bench.driver.run()
+    async with running_at_30_degC(make, tmp_path) as bench:
         bench.fake.press_setpoint(50.0)
         found = await bench.read()
         assert found["fault"].reason == "set point changed at the unit, from 30 to 50 degC"
