@@ -71,10 +71,12 @@ def photo(index: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
     return photograph(scene_at(index), clean, index)
 
 
-def published(index: int, time_ns: int) -> Iterator[Item]:
+def published(index: int, time_ns: int, bits: int = 8) -> Iterator[Item]:
     role, chamber_degC = SEQUENCE[index]
     parameters: dict[str, object] = {"frames": 1, "role": role, "chamber_degC": chamber_degC}
     image = np.full((480, 640), 3, np.uint8) if index == DARK else photo(index)
+    if bits > 8:
+        image = image.astype(np.uint16) * np.uint16(1 << (bits - 8))
     if index < len(SEQUENCE) - 1:
         air = Reading("thermometers.air", chamber_degC + 0.1, "degC", time_ns)
         yield Batch("thermometers", time_ns, (air,))
@@ -83,7 +85,11 @@ def published(index: int, time_ns: int) -> Iterator[Item]:
 
 
 async def record(
-    directory: Path, attachments: dict[str, str], frames: int = len(SEQUENCE), events: Mapping[int, Event] | None = None
+    directory: Path,
+    attachments: dict[str, str],
+    frames: int = len(SEQUENCE),
+    events: Mapping[int, Event] | None = None,
+    bits: int = 8,
 ) -> None:
     """The first frames of the sequence, one a minute; events come right after the frame of that index."""
     clock, hub = VirtualClock(START_NS), Hub()
@@ -94,7 +100,7 @@ async def record(
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
     for index in range(frames):
         await clock.sleep_until(START_NS + index * 60 * NS_PER_S)
-        for item in published(index, clock.now_ns()):
+        for item in published(index, clock.now_ns(), bits):
             hub.publish(item)
         if events and index in events:
             hub.publish(events[index])

@@ -29,7 +29,7 @@ from recording.format.mcap_bytes import RECORD
 from recording.format.records import frame_places
 from recording.reading.session import Session
 
-from .conftest import Recorded
+from .conftest import TARGET_YAML, Recorded, record
 
 CRC_AT = 24  # in a chunk's record, behind two instants and a size
 HEAD_BYTES = 64
@@ -76,10 +76,20 @@ def test_what_is_found_is_near_the_truth_and_a_dark_frame_has_its_reason(recorde
     assert np.abs((found.centres_px - recorded.true_px)[seen]).max() < 0.1
 
 
-def test_frames_decoded_in_part_give_what_whole_images_give(recorded: Recorded, pieces: list[Piece]):
-    found, previous = find_markers(pieces[0]), None
-    for number, frame in enumerate(islice(Session.open(recorded.path).frames(), 5)):
-        previous = detect(frame.image, pieces[0].target, previous, pieces[0].noise)
+@pytest.mark.parametrize("bits", [8, 12])
+async def test_frames_decoded_in_part_give_what_whole_images_give(
+    recorded: Recorded, pieces: list[Piece], bits: int, tmp_path: Path
+):
+    """Those of more than 8 bit are decoded whole."""
+    session, piece = Session.open(recorded.path), pieces[0]
+    if bits > 8:
+        await record(tmp_path / "deep", {"target.yaml": TARGET_YAML}, frames=3, bits=bits)
+        session = Session.open(tmp_path / "deep")
+        (piece,) = pieces_of(session, session_target(session), frames_per_piece=5)
+    found, previous = find_markers(piece), None
+    for number, frame in enumerate(islice(session.frames(), len(found.centres_px))):
+        assert frame.image.itemsize == -(-bits // 8)
+        previous = detect(frame.image, piece.target, previous, piece.noise)
         np.testing.assert_array_equal(found.centres_px[number], previous.centres_px)
         np.testing.assert_array_equal(found.covariance_px2[number], previous.covariance_px2)
 
