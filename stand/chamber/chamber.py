@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.devices.chambers.climate_chamber import ClimateChamber
@@ -37,6 +37,15 @@ class ChamberLimits:
     K_per_min: float = math.inf
 
 
+@dataclass(frozen=True, slots=True)
+class Ordered:
+    """What the chamber was told, whether the regulator answers now or not: the set-point, and since when heat and cold
+    are permitted (ns)."""
+
+    setpoint_degC: float
+    since_ns: int
+
+
 class Chamber:
     """Set-point, heat and cold. `permits` owns the permissions to heat and cool, `keeper` renews them; `coils_read` is
     given what the relays read each time it does."""
@@ -58,10 +67,16 @@ class Chamber:
         self._hub = hub
         self._clock = clock
         self._asked = object()  # the last order; one that is under way ends with the next
+        self._ordered: Ordered | None = None
         self.compressor_file = CompressorFile(limits.compressor_file, hub, clock)
         compressor = restored(limits.compressor_file, clock.now_ns(), boot_of(clock))
         self.permits = Permits(relays, limits.permits, compressor, self.compressor_file.note, hub, clock)
         self.keeper = Keeper(self.permits, regulator, hub, clock, limits.renew_s, coils_read)
+
+    @property
+    def ordered(self) -> Ordered | None:
+        """None while nothing is permitted: the set-point that the regulator remembers is then nobody's wish."""
+        return self._ordered if self.permits.granted else None
 
     async def start(self, setpoint_degC: float) -> None:
         """Permit heating and cooling, set the set-point, run the regulator; done when the set-point is there. A
@@ -70,6 +85,8 @@ class Chamber:
         asked = self._asked = object()
         await self._send(way_degC[0])
         self._interlock.check()  # after every wait: a fault may have closed it meanwhile
+        since_ns = self._clock.now_ns() if self.ordered is None else self.ordered.since_ns
+        self._ordered = Ordered(setpoint_degC, since_ns)
         self.permits.grant()
         try:
             await self.keeper.beat()
@@ -90,6 +107,8 @@ class Chamber:
         way_degC = await self._way_to(setpoint_degC)
         asked = self._asked = object()
         await self._send(way_degC[0])
+        if self._ordered is not None:
+            self._ordered = replace(self._ordered, setpoint_degC=setpoint_degC)
         await self._walk(way_degC[1:], asked)
 
     async def _way_to(self, setpoint_degC: float) -> list[float]:

@@ -24,7 +24,7 @@ from stand.commands.sessions.session_text import size
 from stand.gate import INTERLOCK, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import RunStatus, StandState
-from stand.watching.moment import SET_POINT
+from stand.watching.moment import SET_POINT, heat_by_hand
 from stand.watching.remedies import for_reason, next_command
 
 app = App()
@@ -208,13 +208,16 @@ def _number(planned: Answer) -> int:
 def idle_lines(name: str, state: StandState) -> Iterator[str]:
     """`stand status` between runs."""
     yield _row("stand", f"{state.stand} ({name})")
-    yield _row("state", state.phase if not state.reasons else f"{state.phase}: {', '.join(state.reasons)}")
+    found = state.phase if state.by_hand is None else heat_by_hand(state)
+    yield _row("state", found if not state.reasons else f"{found}: {', '.join(state.reasons)}")
+    if state.by_hand is not None:
+        yield _row("next", "`stand stop` ends the heat")
     if state.fault is not None:
         yield _row("fault", f"{state.fault.rule}: {state.fault.text}")
     for channel, reading in state.readings.items():
         if reading.unit == "degC":
             known = f"no reading: {reading.reason}" if reading.value is None else f"{reading.value:.2f} degC"
-            is_idle = channel == SET_POINT and state.setpoint_degC is None
+            is_idle = channel == SET_POINT and state.setpoint_degC is None and reading.value is not None
             yield _row("temperatures", f"{channel} {'none' if is_idle else known}")
     waiting = sum(run.state in ("waiting", "interrupted") for run in state.queue)
     yield _row("queue", f"{waiting} to be run" + (f"; halted: {state.queue_halted}" if state.queue_halted else ""))

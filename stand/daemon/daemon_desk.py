@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import NoReturn, TypeVar
 
 from pydantic import JsonValue
@@ -21,6 +22,7 @@ from stand.serving.desk import (
     Done,
     FaultRequest,
     FaultState,
+    HeatByHand,
     PlanStep,
     QueuedRun,
     RunRequest,
@@ -62,6 +64,8 @@ class DaemonDesk:
             changes["disk_free_bytes"] = daemon.disk_free_bytes
             if daemon.has_guest:
                 changes["phase"] = "stopping" if daemon.orders.leaving else "running"
+            else:
+                changes["by_hand"] = self._heat_by_hand()
         return state.model_copy(update=changes)
 
     def plan(self) -> tuple[PlanStep, ...]:
@@ -187,6 +191,11 @@ class DaemonDesk:
         if fault is None:
             return None
         return FaultState(rule=fault.rule, text=fault.text, since_ns=open_stand.fault_ns, data=fault.data)
+
+    def _heat_by_hand(self) -> HeatByHand | None:
+        """As it was ordered: what the regulator says of it is unknown while its wire is gone."""
+        ordered = self._assembly.stand.chamber.ordered
+        return None if ordered is None else HeatByHand(**asdict(ordered))
 
     def _of_run(
         self, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], call: Callable[[RunDesk], Result]

@@ -173,15 +173,24 @@ class QueuedRun(Value):
     added_by: str = ""
 
 
+class HeatByHand(Value):
+    """Heat and cold that somebody ordered between runs. setpoint_degC: as it was ordered, also while the regulator does
+    not answer; since_ns: when they were permitted."""
+
+    setpoint_degC: float
+    since_ns: int
+
+
 class StandState(Value):
     """The whole stand at one instant, as the control loop published it.
 
     seq: the sequence number of the stream that this state is after. version: of the program. phase: idle between runs.
-    reasons: what holds the run. readings: the last of every channel. setpoint_degC: of the chamber, None when it is
-    stopped or unknown. output_percent: of the regulator. flap: "open", "closed", "moving", or "" when it is not
-    known. axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles, ...). moving:
-    what is under way, as in `linear to 250 mm`. busy: the devices that carry out an order. drops: items that the
-    interface was too slow for. pausing: a pause comes when the step under way is done.
+    by_hand: heat that somebody ordered then. reasons: what holds the run. readings: the last of every channel.
+    setpoint_degC: of the chamber, None when it is stopped or unknown. output_percent: of the regulator. flap: "open",
+    "closed", "moving", or "" when it is not known. axes: positions, mm or deg. counters: what wears, by name
+    (compressor_hours, relay_cycles, ...). moving: what is under way, as in `linear to 250 mm`. busy: the devices that
+    carry out an order. drops: items that the interface was too slow for. pausing: a pause comes when the step under way
+    is done.
     """
 
     seq: int = 0
@@ -195,6 +204,7 @@ class StandState(Value):
     reasons: tuple[str, ...] = ()
     fault: FaultState | None = None
     prompt: PromptState | None = None
+    by_hand: HeatByHand | None = None
     readings: dict[str, ReadingState] = Field(default_factory=dict)
     setpoint_degC: float | None = None
     output_percent: float | None = None

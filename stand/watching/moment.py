@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from foundation.instants import local_text
 from stand.estimating.run_estimate import existing
 from stand.gate import IN_WORDS
 from stand.serving.desk import StandState
@@ -48,7 +49,8 @@ def moment_of(state: StandState, drift_px: float | None = None) -> Moment:
     setpoint_degC, air_degC, camera_degC = state.setpoint_degC, _value(state, AIR), _value(state, CAMERA)
     if run is None:
         waiting = sum(each.state == "waiting" for each in state.queue)
-        doing = f"no run; {waiting} queued" if waiting else "no run"
+        queued = f"{waiting} queued" if waiting else ""
+        doing = "; ".join(part for part in ("no run", heat_by_hand(state), queued) if part)
         return Moment(
             state.now_ns + offset_ns,
             state.stand,
@@ -78,6 +80,14 @@ def moment_of(state: StandState, drift_px: float | None = None) -> Moment:
         end_ns=None if run.end_ns is None else run.end_ns + run.utc_offset_ns,
         end_within_s=run.end_within_s,
     )
+
+
+def heat_by_hand(state: StandState) -> str:
+    """`heated by hand to 40 °C since 2026-01-01 19:00:04 CET`; "" when nobody heats by hand."""
+    if state.by_hand is None:
+        return ""
+    since = local_text(state.by_hand.since_ns + state.utc_offset_ns)
+    return f"heated by hand to {state.by_hand.setpoint_degC:g} °C since {since}"
 
 
 def _value(state: StandState, channel: str) -> float | None:

@@ -27,6 +27,7 @@ from stand.serving.desk import (
     DeviceState,
     Done,
     FaultRequest,
+    HeatByHand,
     KnownFault,
     Missing,
     PlanStep,
@@ -60,6 +61,7 @@ class ADesk:
         for reason in reasons:
             self.gate.hold(reason)
         self.run = run
+        self.by_hand: HeatByHand | None = None
         self.moving: tuple[str, ...] = ()
         self.orders: list[tuple[Who, Verb, dict[str, JsonValue]]] = []
         self.queue: list[QueuedRun] = []
@@ -89,6 +91,7 @@ class ADesk:
             phase="held" if self.gate.reasons else "idle" if self.run is None else "running",
             run=self.run,
             reasons=tuple(sorted(self.gate.reasons)),
+            by_hand=self.by_hand,
             readings={
                 name: ReadingState(
                     value=None if each.quality == "bad" else each.value,

@@ -17,7 +17,7 @@ from pydantic import JsonValue
 from experiments.steps import PlannedStep, step_of
 from foundation.clock import NS_PER_S, WallClock
 from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading
+from foundation.readings import Frame, Reading, bad_reading
 from stand.config.stand_config import load_config, packaged
 from stand.gate import INTERLOCK, OPERATOR
 from stand.running.memory.entries import Step as StepMarked
@@ -64,6 +64,7 @@ class NightDesk(ADesk):
         self.fault: FaultState | None = None
         self.prompt: PromptState | None = None
         self.is_idle = False
+        self.lost = ""  # a device that does not answer
         self.stops = 0
         self.viewing: Viewing | None = None
         self.began_ns = self.clock.now_ns() - round(10.6 * 3600 * NS_PER_S)
@@ -113,7 +114,7 @@ class NightDesk(ADesk):
                 "reasons": reasons,
                 "fault": self.fault,
                 "prompt": self.prompt,
-                "setpoint_degC": set_point_degC(self.now_s()),
+                "setpoint_degC": values.get("regulator.sp", set_point_degC(self.now_s())),
                 "output_percent": values.get("regulator.mv_heat"),
                 "heater_permitted": not self.fault,
                 "compressor_on": bool(values.get("relays.compressor")),
@@ -295,8 +296,13 @@ class NightDesk(ADesk):
         """Poll once a second."""
         while True:
             for batch in self.batches(self.now_s(), 1.0):
-                self.hub.publish(batch)
+                self.hub.publish(_lost(batch) if batch.device == self.lost else batch)
             await asyncio.sleep(1.0)
+
+
+def _lost(batch: Batch) -> Batch:
+    bad = (bad_reading(each.channel, each.unit, each.time_ns, "no answer", "wire") for each in batch.readings)
+    return Batch(batch.device, batch.time_ns, tuple(bad))
 
 
 def target_image(dx: float, dy: float, size: tuple[int, int] = (1224, 1024)) -> np.ndarray:

@@ -8,6 +8,7 @@ from foundation.clock import seconds_ns
 from foundation.errors import ConfigError, DeviceFault, GarbledReply, Occupied, StandTripped, Unreachable
 from foundation.readings import Reading
 from foundation.tasks import cancelled
+from stand.chamber.chamber import Ordered
 from stand.chamber.permits import HEATER
 from stand.fault import Fault
 from stand.gate import INTERLOCK
@@ -23,6 +24,28 @@ async def test_heat_is_permitted_after_the_set_point_and_before_the_regulator_ru
         await here.stand.chamber.stop()
         assert here.calls[3:] == ["regulator stop", "relays make_safe"]
         assert not here.stand.chamber.permits.granted
+
+
+async def test_what_was_ordered_is_known_while_the_regulator_does_not_answer_and_until_it_is_stopped():
+    async with rooms() as here:
+        chamber = here.stand.chamber
+        await chamber.set_temperature(30.0)  # permits nothing
+        assert chamber.ordered is None
+        await chamber.start(45.0)
+        first = chamber.ordered
+        assert first == Ordered(45.0, seconds_ns(2))  # the set-point is there after a second each
+        here.regulator.failures.append(Unreachable("regulator", "its wire is gone"))
+        with pytest.raises(Unreachable):
+            await chamber.set_temperature(20.0)
+        assert chamber.ordered == first
+        await chamber.start(40.0)
+        await chamber.set_temperature(50.0)
+        assert chamber.ordered == Ordered(50.0, first.since_ns)
+        await chamber.stop()
+        assert chamber.ordered is None
+        await chamber.start(25.0)
+        here.stand.safety.demand()
+        assert chamber.ordered is None
 
 
 async def test_a_regulator_that_does_not_run_leaves_no_permission_to_heat():

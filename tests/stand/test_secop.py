@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from stand.gate import INTERLOCK
-from stand.serving.desk import FaultState
+from stand.serving.desk import FaultState, HeatByHand
 from stand.serving.secop import door
 from stand.serving.secop.secop_lines import LINE_LIMIT_BYTES, Request, message, parsed
 from tests.stand.secop_desk import JAM, NO, WIRE, SecopDesk, node
@@ -213,6 +213,13 @@ async def test_a_stage_is_busy_until_it_has_been_read_where_it_is(tmp_path: Path
         assert (await talk.asked("change flap:target 1"))[2][0] == 1
         assert (await talk.asked('change flap:target "closed"'))[2][0] == 0  # an enum takes its names, too
     assert [order[2]["verb"] for order in desk.orders] == ["move", "home", "open", "close"]
+
+
+async def test_heat_by_hand_is_in_the_status_of_the_stand(tmp_path: Path):
+    desk = SecopDesk()
+    desk.by_hand = HeatByHand(setpoint_degC=40.0, since_ns=0)
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        assert (await talk.asked("read run:status"))[2][0] == [100, "heat by hand, set-point 40 degC"]
 
 
 async def test_stop_and_what_concerns_runs(tmp_path: Path):

@@ -15,10 +15,11 @@ from foundation.clock import NS_PER_S
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Reading, bad_reading
 from recording.format.utc_offsets import UtcOffsets
+from stand.commands.control_cli import idle_lines
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price
 from stand.estimating.run_estimate import Night
-from stand.serving.desk import ReadingState, StandState
+from stand.serving.desk import HeatByHand, ReadingState, StandState
 from stand.watching.follow import Follow
 from stand.watching.live import Foot, Lines
 from stand.watching.moment import Moment, moment_of
@@ -179,6 +180,11 @@ def test_a_stand_that_a_daemon_has_is_shown_alike():
     assert (seen.held, seen.end_within_s) == ("held by an operator's pause", 90.0)
     idle = moment_of(state.model_copy(update={"run": None, "reasons": (), "queue_halted": "somebody pressed STOP"}))
     assert (idle.doing, idle.held, idle.end_ns) == ("no run", "somebody pressed STOP", None)
+    by_hand = HeatByHand(setpoint_degC=40.0, since_ns=BEGIN_NS)
+    heated = state.model_copy(update={"run": None, "reasons": (), "phase": "idle", "by_hand": by_hand})
+    since = "heated by hand to 40 °C since 2026-01-01 18:00:00 UTC"
+    assert moment_of(heated).doing == f"no run; {since}"
+    assert f"state         {since}" in idle_lines("out", heated)
 
 
 def shown_shares(lines: list[str]) -> list[int]:

@@ -17,7 +17,8 @@ import pytest
 from foundation.clock import WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub
-from foundation.items import Event
+from foundation.items import Batch, Event
+from foundation.readings import bad_reading
 from recording.reading.notes import read_notes
 from recording.reading.session import Session
 from stand.assembly import assemble
@@ -28,7 +29,7 @@ from stand.daemon.day_record import DayRecord
 from stand.daemon.serve import serve as serve_stand
 from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
-from stand.serving.desk import Conflict, RunRequest, StandState, Who
+from stand.serving.desk import Conflict, HeatByHand, RunRequest, StandState, Who
 from tests import forked
 from tests.system.test_real_time import BRIEF as CYCLE
 from tests.system.test_two_runs import Laboratory
@@ -142,11 +143,18 @@ def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(s
     served.until(lambda state: abs((state.axes["linear"] or 0.0) - 3.0) < 0.01)
     served.post("devices/camera/frame", arguments={"exposure_s": 0.01})
     served.post("devices/regulator/set", arguments={"setpoint_degC": 30.0})
-    served.until(lambda state: state.setpoint_degC == 30.0 and state.readings["relays.heater_enable"].value == 1)
+    heated = served.until(
+        lambda state: state.setpoint_degC == 30.0 and state.readings["relays.heater_enable"].value == 1
+    )
+    assert heated.phase == "idle"
+    assert heated.by_hand is not None
+    assert heated.by_hand.setpoint_degC == 30.0
+    assert 0 < heated.now_ns - heated.by_hand.since_ns < LIMIT_S * 1e9
     with pytest.raises(SessionError, match=r"outside|limits"):
         served.post("devices/regulator/set", arguments={"setpoint_degC": 300.0})
     served.post("run/stop")
     served.until(lambda state: state.readings["relays.heater_enable"].value == 0 and state.setpoint_degC is None)
+    assert served.state().by_hand is None
     counters = served.state().counters
     assert counters["flap_cycles"] >= 1
     assert counters["stage_cycles.linear"] >= 1
@@ -378,6 +386,14 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
             await until(lambda: clock.now_ns() > turned_ns + 3_000_000_000)  # the guard looks each second
             assert desk.state().heater_permitted
             assert desk.state().fault is None
+            by_hand = desk.state().by_hand
+            assert by_hand is not None
+            now_ns = clock.now_ns()
+            lost = tuple(bad_reading(f"regulator.{name}", "1", now_ns, "no answer") for name in ("sp", "running"))
+            hub.publish(Batch("regulator", now_ns, lost))
+            assert (desk.state().setpoint_degC, desk.state().by_hand) == (None, by_hand)  # its wire is gone
+            await until(lambda: desk.state().setpoint_degC == 40.0)
+            assert desk.state().by_hand == by_hand == HeatByHand(setpoint_degC=40.0, since_ns=by_hand.since_ns)
             assert daemon.open_stand.recorder is daemon.record.recorder
 
         working = asyncio.create_task(work())

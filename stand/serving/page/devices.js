@@ -80,7 +80,7 @@ export class Devices {
       }
       rows.forEach((channel, index) => {
         const reading = state.readings[channel];
-        const is_idle = channel === "regulator.sp" && state.setpoint_degC === null; // what the regulator remembers is nobody's wish
+        const is_idle = channel === "regulator.sp" && state.setpoint_degC === null && reading.value !== null; // what the regulator remembers is nobody's wish
         say(values.children[2 * index + 1], is_idle ? "none" : reading.value === null ? `no reading: ${reading.reason}` : value_of(channel, reading));
       });
     }

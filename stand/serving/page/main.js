@@ -11,7 +11,7 @@ import { arm } from "./stop.js";
 import { follow } from "./stream.js";
 
 const VIEWS = { now: Now, plan: Plan, queue: Queue, camera: CameraView, sessions: Sessions, devices: Devices };
-const PHASE = { idle: "Idle", running: "Running", held: "Held", stopping: "Stopping", tripped: "Tripped", lost: "No connection" };
+const PHASE = { idle: "Idle", by_hand: "Heat by hand", running: "Running", held: "Held", stopping: "Stopping", tripped: "Tripped", lost: "No connection" };
 const at = (id) => document.getElementById(id);
 
 const app = {
@@ -42,17 +42,23 @@ function open() {
 function show(state) {
   app.state = state;
   app.state_ms = performance.now();
-  const phase = state.fault ? "tripped" : state.phase;
+  const phase = state.fault ? "tripped" : state.by_hand ? "by_hand" : state.phase;
   say(at("stand"), state.stand);
   at("simulated").hidden = !state.simulated;
   at("phase").dataset.phase = phase;
   say(at("phase"), PHASE[phase]);
   const { run } = state;
-  say(at("doing"), run ? `${run.recipe}: step ${run.step} of ${run.steps}, ${run.doing}` : phase === "running" ? "a run begins" : state.setpoint_degC === null ? "no run" : `no run; chamber at ${state.setpoint_degC} °C`);
+  say(at("doing"), run ? `${run.recipe}: step ${run.step} of ${run.steps}, ${run.doing}` : phase === "running" ? "a run begins" : between_runs(state));
   say(at("eta"), run?.end_ns ? `ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(run)}` : clock(app.now_s()));
   document.title = `${PHASE[phase]} · ${state.stand}`;
   notices.update(state);
   app.view.update(state);
+}
+
+// What was ordered by hand is known also while the regulator does not answer; else what that says it does.
+function between_runs({ by_hand, setpoint_degC, utc_offset_ns }) {
+  if (by_hand) return `set to ${by_hand.setpoint_degC} °C, on since ${day_clock(seconds(by_hand.since_ns, utc_offset_ns))}`;
+  return setpoint_degC === null ? "no run" : `no run; chamber at ${setpoint_degC} °C`;
 }
 
 function lost() {

@@ -168,7 +168,7 @@ export class Now {
     row.dataset.quality = reading.quality;
     row.title = reading.reason;
     const state = this.app.state, bad = { bad: "no reading", stale: "old" }[reading.quality];
-    const unasked = channel === "regulator.sp" && state.setpoint_degC === null ? "none"
+    const unasked = channel === "regulator.sp" && state.setpoint_degC === null && reading.value !== null ? "none"
       : reading.value === null && !state.camera_on && this.app.cameras().includes(channel.split(".")[0]) ? "off" : "";
     if (unasked) row.dataset.quality = "good"; // nobody expects one now
     say(value, unasked || (reading.value === null ? bad ?? "–" : `${number(reading.value, 2)} °C${bad ? ` (${bad})` : ""}`));
