@@ -24,7 +24,7 @@ _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera
 # of a file that makes something once for all of them, or whose devices have the same serial numbers.
 _DEALT_OUT = PurePath("tests/system")
 # A worker that took these last would be the only one at work for a minute.
-_LONG_FILES = {"tests/stand/test_page.py", "tests/stand/test_page_room.py"}
+_LONG_FILES = {f"tests/stand/test_page{part}.py" for part in ("", "_orders", "_room")}
 _TOGETHER = {
     # Real devices belong to one program by their serial numbers, whatever their addresses.
     "tests/system/test_queue_wires.py",

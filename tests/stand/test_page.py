@@ -1,48 +1,20 @@
-"""The page in a real browser, as somebody uses it at night. The stand behind it is a desk that a test sets."""
+"""What the page shows, in a real browser. The stand behind it is a desk that a test sets."""
 
 import asyncio
-import json
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
-import pytest_asyncio
+from axe_playwright_python.base import AXE_SCRIPT
 
 from foundation.clock import NS_PER_S
-from foundation.documents import parse_document
 from foundation.items import Batch
 from foundation.readings import Reading
-from stand.config.recipe import Recipe
-from stand.config.stand_config import packaged
-from stand.gate import NOT_RECORDED, OPERATOR
+from stand.serving.desk import HeatByHand
 from tests.recording.recorded import record
-from tests.stand.browser import DESKTOP, PHONE, a_page, browser, needs_chromium
+from tests.stand.browser import PHONE, VIEWS, a_page, needs_chromium
 from tests.stand.page_desk import a_night, frame_of, free_port, target_image
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
-VIEWS = ("now", "plan", "queue", "camera", "sessions", "devices")
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def chromium():
-    """One for all: each page has a context of its own, and starting a browser takes longer than most tests."""
-    async with browser() as chromium:
-        yield chromium
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def night(tmp_path, chromium):
-    port = free_port()
-    async with a_night(tmp_path / "sessions", port) as desk:
-        desk.port, desk.chromium = port, chromium
-        yield desk
-
-
-async def until(check, timeout_s=30.0):
-    """Wait for what another process does."""
-    async with asyncio.timeout(timeout_s):
-        while not check():
-            await asyncio.sleep(0.05)
-
 
 INK = """() => { const c = document.querySelector(".curve canvas");
 if (!c || !c.width) return 0;
@@ -50,11 +22,6 @@ const points = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
 return points.filter((value, n) => n % 4 === 3 && value).length }"""
 WHOLE_HEADER = """() => [...document.querySelectorAll("header .who, header .doing, header .eta")].every(
     (part) => part.scrollWidth <= part.clientWidth && part.scrollHeight <= part.clientHeight + 1)"""
-STOP_IS_ON_TOP = """() => { const b = document.getElementById("stop").getBoundingClientRect();
-const [w, h] = [b.width, b.height];
-const inside = b.top >= 0 && b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight;
-const points = [[8, 8], [w - 8, 8], [8, h - 8], [w - 8, h - 8], [w / 2, h / 2]];
-return inside && points.every(([x, y]) => document.elementFromPoint(b.left + x, b.top + y)?.id === "stop") }"""
 
 
 async def ink(page):
@@ -79,6 +46,20 @@ async def test_the_page_shows_the_stand_and_its_curves_move(night):
             before = await picture(page)
             while await picture(page) == before:
                 await asyncio.sleep(0.2)
+
+
+async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_answer(night):
+    night.is_idle = True
+    async with a_page(night.chromium, night.port, size=PHONE) as page:
+        await page.get_by_text("Idle", exact=True).wait_for()
+        night.by_hand = HeatByHand(setpoint_degC=40.0, since_ns=night.clock.now_ns())
+        for night.lost, said in (("", "°C"), ("regulator", "no reading"), ("", "°C")):
+            await page.locator(".readings tr", has_text="set-point").locator(".value", has_text=said).wait_for()
+            await page.locator("#phase", has_text="Heat by hand").wait_for()
+            await page.locator("#doing", has_text="set to 40 °C, on since ").wait_for()
+            assert await page.evaluate(WHOLE_HEADER)
+        night.by_hand = None
+        await page.get_by_text("Idle", exact=True).wait_for()
 
 
 async def test_event_marks_and_the_night_are_there_after_a_reload(night):
@@ -111,243 +92,6 @@ async def test_zooming_shows_a_part_of_the_night_and_the_way_back(night):
         assert found["points"] * found["width_ns"] / NS_PER_S == pytest.approx(4320, rel=0.15)
         await page.get_by_role("button", name="Back to now").click()
         await page.get_by_role("button", name="Back to now").wait_for(state="hidden")
-
-
-async def test_pause_and_continue_make_the_round(night):
-    async with a_page(night.chromium, night.port, "plan") as page:
-        await page.get_by_role("button", name="Pause now").click()
-        await page.locator("#phase", has_text="Held").wait_for()
-        assert night.gate.reasons == {OPERATOR}
-        await page.get_by_text("paused by an operator").first.wait_for()
-        await page.locator("main").get_by_role("button", name="Continue").click()
-        await page.locator("#phase", has_text="Running").wait_for()
-        assert [verb for _, verb, _ in night.orders] == ["pause", "continue"]
-        night.gate.hold(NOT_RECORDED)
-        await page.get_by_text("The run is held: the disk takes no telemetry").wait_for()
-        await page.get_by_text("It goes on when the disk takes what waits").wait_for()
-
-
-async def test_stop_is_immediate_and_asks_nothing(night):
-    async with a_page(night.chromium, night.port) as page:
-        await page.get_by_text("Running", exact=True).wait_for()
-        box = await page.locator("#stop").bounding_box()
-        await page.mouse.move(box["x"] + 20, box["y"] + 20)
-        await page.mouse.down()  # not even the release is waited for
-        await until(lambda: night.stops)
-        await page.get_by_text("the stand is made safe").first.wait_for()
-        await page.locator("#phase", has_text="Stopping").wait_for()
-
-
-async def test_escape_twice_stops_and_once_does_not(night):
-    async with a_page(night.chromium, night.port) as page:
-        await page.get_by_text("Running", exact=True).wait_for()
-        await page.keyboard.press("Escape")
-        await page.wait_for_timeout(300)
-        assert not night.stops
-        await page.keyboard.press("Escape")
-        await until(lambda: night.stops)
-
-
-async def test_stop_goes_on_until_the_stand_has_heard_it(night):
-    async with a_page(night.chromium, night.port) as page:
-        await page.get_by_text("Running", exact=True).wait_for()
-        tries = []
-
-        async def deaf(route):
-            tries.append(route)
-            await (route.abort() if len(tries) < 3 else route.continue_())
-
-        await page.route("**/run/stop", deaf)
-        await page.locator("#stop").click()
-        await page.get_by_text("NOT STOPPED").wait_for()
-        await until(lambda: night.stops)
-        await page.get_by_text("the stand is made safe").first.wait_for()
-
-
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-async def test_nothing_ever_lies_over_stop(night, size):
-    """With a fault, a prompt, a pause and a question open, in every view and however far it is scrolled."""
-    async with a_page(night.chromium, night.port, size=size) as page:
-        await page.get_by_text("Running", exact=True).wait_for()
-        night.trip()
-        night.ask_operator("Roll the camera by 20 degrees")
-        await page.get_by_text("The run waits for you").wait_for()
-        await page.get_by_role("button", name="Look at it and clear").click()
-        for view in VIEWS:
-            await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
-            await page.wait_for_timeout(200)
-            for down in (0, 100_000):
-                await page.mouse.wheel(0, down)
-                assert await page.evaluate(STOP_IS_ON_TOP), view
-
-
-async def test_a_fault_appears_and_is_cleared_only_after_it_was_shown(night):
-    async with a_page(night.chromium, night.port) as page:
-        await page.get_by_text("Running", exact=True).wait_for()
-        night.trip()
-        await page.locator("#phase", has_text="Tripped").wait_for()
-        alert = page.get_by_role("alert")
-        assert "71.2" in await alert.inner_text()
-        assert not await page.get_by_role("button", name="The cause is removed").is_visible()
-        await page.get_by_role("button", name="Look at it and clear").click()
-        await page.get_by_text("Readings now").wait_for()
-        assert "°C" in await alert.inner_text()
-        await page.get_by_role("button", name="The cause is removed").click()
-        await page.locator("#phase", has_text="Running").wait_for()
-        await alert.wait_for(state="detached")
-        assert [verb for _, verb, _ in night.orders] == ["clear"]
-
-
-async def test_a_prompt_is_answered(night):
-    async with a_page(night.chromium, night.port) as page:
-        await page.get_by_text("Running", exact=True).wait_for()
-        night.ask_operator("Roll the camera by 20 degrees, <script>alert(1)</script>")
-        await page.get_by_text("Roll the camera by 20 degrees, <script>").first.wait_for()
-        await page.get_by_role("button", name="Done, go on").click()
-        await page.get_by_text("The run waits for you").wait_for(state="detached")
-        assert [verb for _, verb, _ in night.orders] == ["continue"]
-
-
-async def test_the_plan_is_a_time_line_whose_steps_are_left_out_and_extended(night):
-    async with a_page(night.chromium, night.port, "plan") as page:
-        under_way = page.locator(".steps li[data-standing='under_way']")
-        await under_way.wait_for()
-        assert "earned" in await under_way.inner_text()
-        await page.get_by_role("button", name="+15 min: step 32").click()
-        await until(lambda: night.orders)
-        assert night.orders[-1][2]["by_s"] == 900
-        await page.get_by_role("button", name="Skip: step 35").click()
-        assert len(night.orders) == 1  # it asks first
-        await page.get_by_role("button", name="Leave it out").click()
-        await until(lambda: len(night.orders) == 2)
-        await page.get_by_role("button", name="End the run").click()
-        assert not night.stops
-        await page.get_by_role("group", name="End the run").get_by_role("button", name="End the run").click()
-        await until(lambda: night.stops)
-
-
-async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night):
-    async with a_page(night.chromium, night.port, "plan") as page:
-        await page.get_by_role("button", name="Edit the steps to come").click()
-        editor = page.get_by_role("group", name="Steps to come")
-        await editor.get_by_text("4 steps, 1 h 03 min").wait_for()  # what the stand says of it as it is
-        rows = editor.get_by_role("listitem")
-        await editor.get_by_role("button", name="Remove: step 33").click()
-        await rows.nth(0).get_by_label("chamber °C").fill("75")
-        await editor.get_by_role("button", name="Duplicate: step 34").click()
-        await editor.get_by_role("button", name="Use these steps").click()
-        await rows.nth(0).get_by_text("a set-point of 75 degC").wait_for()
-        assert not night.edited
-        assert await rows.nth(2).locator(".error").is_hidden()
-        await rows.nth(0).get_by_label("chamber °C").fill("30")
-        assert await rows.nth(3).get_by_label("chamber °C").input_value() == "30"  # the label of the frames there
-        await rows.nth(1).get_by_label("duration, s").fill("600")
-        await rows.nth(1).get_by_text("soak for 10 min").wait_for()
-        await editor.get_by_role("button", name="Later: step 34").click()
-        await editor.get_by_label("Kind of step to add").select_option("Prompt")
-        await editor.get_by_role("button", name="Add this step").click()
-        await editor.get_by_role("button", name="Use these steps").click()
-        await rows.nth(4).get_by_text("text: ").wait_for()
-        await rows.nth(4).get_by_label("text").fill("Look at the lens")
-        await editor.get_by_role("button", name="Use these steps").click()
-        await until(lambda: night.edited)
-        await editor.wait_for(state="detached")
-        assert night.orders[-1][2] == {"from_index": 32, "steps": 5}
-        assert night.edited[3].parameters["chamber_degC"] == 30
-        assert [step.kind for step in night.edited] == ["StartChamber", "Soak", "Soak", "Capture", "Prompt"]
-
-
-async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):
-    async with a_page(night.chromium, night.port, "queue") as page:
-        await page.get_by_text("Look at and change its parameters").click()
-        frames = page.get_by_label("frames", exact=True).first
-        assert await frames.input_value() == "3600"
-        answered = asyncio.Event()
-
-        async def late(route):
-            await answered.wait()
-            await route.continue_()
-
-        await page.route("**/recipes/overnight", late)
-        await page.get_by_label("recipe", exact=True).select_option("overnight")
-        assert await frames.is_disabled()  # what is typed now would be lost when the answer comes
-        answered.set()
-        await frames.fill("120")
-        await page.get_by_label("cameras", exact=True).first.fill("lens A, lens B")
-        await page.get_by_role("button", name="Add to the queue").click()
-        await page.get_by_role("status").filter(has_text="is queued").wait_for()
-        run = night.queue[-1]
-        order, _ = night.requests[run.key]
-        assert '"frames":120' in order.recipe_text
-        assert '"cameras":["lens A","lens B"]' in order.recipe_text
-        assert '"held_out_degC":[17,38]' in order.recipe_text
-        await page.get_by_label("frames", exact=True).first.fill("-5")
-        await page.get_by_role("button", name="Add to the queue").click()
-        assert len(night.queue) == 3  # the browser says what is wrong with the field
-
-
-async def test_steps_and_parts_within_parts_have_fields_of_their_own(night):
-    async with a_page(night.chromium, night.port, "queue") as page:
-        await page.get_by_label("recipe", exact=True).select_option("ramps")
-        await page.get_by_text("Look at and change its parameters").click()
-        await page.get_by_label("rate K per min").first.fill("0.7")
-        await page.get_by_label("Kind of steps, one after another").select_option("soak")
-        await page.get_by_role("button", name="Add to steps, one after another").click()
-        await page.get_by_label("soak", exact=True).last.fill("90")
-        await page.get_by_role("button", name="Add to the queue").click()
-        await page.get_by_role("status").filter(has_text="is queued").wait_for()
-        reported = json.loads(night.requests[night.queue[-1].key][0].recipe_text)
-        assert reported["steps"][-1] == {"soak": 90}
-        repeat = next(step["repeat"] for step in reported["steps"] if "repeat" in step)
-        assert repeat["steps"][0]["ramp"]["rate_K_per_min"] == 0.7
-        before = len(list(parse_document(packaged("recipes", "ramps").read_text(), Recipe, "ramps").plan()))
-        assert len(list(parse_document(json.dumps(reported), Recipe, "sent").plan())) == before + 1
-
-
-async def test_runs_are_moved_by_buttons_and_by_dragging_and_removed_after_a_question(night):
-    async with a_page(night.chromium, night.port, "queue") as page:
-        await page.get_by_role("button", name="Later: run 3").click()
-        await until(lambda: night.orders)
-        assert night.orders[-1][2] == {"run": 3, "to": 2}
-        rows = page.get_by_role("list", name="Runs to be done").locator("li")
-        await rows.nth(1).drag_to(rows.nth(0))
-        await until(lambda: len(night.orders) == 2)
-        assert night.orders[-1][2] == {"run": 4, "to": 1}
-        await page.get_by_role("button", name="Remove: run 4").click()
-        await page.get_by_role("button", name="Remove it").click()
-        await until(lambda: len(night.queue) == 1)
-
-
-async def test_devices_take_orders_only_between_runs(night):
-    async with a_page(night.chromium, night.port, "devices") as page:
-        await page.get_by_text("Devices take no orders: a run owns the stand.").wait_for()  # once, for all of them
-        assert await page.get_by_role("button", name="Open", exact=True).is_disabled()
-        night.is_idle = True
-        flap = page.locator("section", has=page.get_by_role("heading", name="flap"))
-        await flap.get_by_role("button", name="Open", exact=True).click()
-        await until(lambda: night.orders)
-        assert night.orders[-1][2] == {"name": "flap", "verb": "open", "arguments": {}}
-
-
-async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(night):
-    async with a_page(night.chromium, night.port, "devices") as page:
-        faults = page.locator("section", has=page.get_by_role("heading", name="Faults on purpose"))
-        await faults.get_by_label("What to break").select_option("flap.jam")
-        await faults.get_by_text("feedback counts at which it stops").wait_for()
-        await faults.get_by_label("value").fill("1500")
-        await faults.get_by_label("for").fill("60")
-        await faults.get_by_role("button", name="break").click()
-        await faults.get_by_role("button", name="mend flap.jam").click()
-        await until(lambda: len(night.orders) == 2)
-        broken, mended = (order[2] for order in night.orders)
-        assert broken == {"name": "flap.jam", "value": 1500, "for_s": 60.0, "mend": False}
-        assert (mended["name"], mended["mend"]) == ("flap.jam", True)
-        night.is_simulated = False
-        await page.locator("#simulated").wait_for(state="hidden")
-    async with a_page(night.chromium, night.port, "devices") as page:
-        await page.get_by_role("heading", name="What wears").wait_for()
-        await page.get_by_role("button", name="Open", exact=True).wait_for()
-        assert await page.get_by_role("heading", name="Faults on purpose").count() == 0
 
 
 @pytest.mark.usefixtures("compiled_fit")
@@ -418,19 +162,29 @@ async def test_a_phone_is_wide_enough_for_every_view(night):
         assert boxes[0]["y"] < boxes[1]["y"]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-async def test_every_view_is_accessible(night, scheme):
-    """axe finds nothing; a fault, a prompt and a pause are on the page."""
-    from axe_playwright_python.async_playwright import Axe
+AXE = """async (rules) => {
+const only = rules && { runOnly: { type: "rule", values: rules } };
+const found = await axe.run({ resultTypes: ["violations"], ...only });
+const all = [found.violations, found.passes, found.incomplete, found.inapplicable].flat();
+return { colour: all.filter((each) => each.tags.includes("cat.color")).map((each) => each.id),
+    violations: found.violations.map((each) => [each.id, each.nodes.map((node) => node.html)]) } }"""
 
+
+async def test_every_view_is_accessible(night):
+    """axe finds nothing; a fault, a prompt and a pause are on the page. In the dark only its rules of colour are asked:
+    nothing but colours is other there (test_the_dark_changes_colours_only)."""
     night.trip()
     night.ask_operator("Roll the camera by 20 degrees")
-    async with a_page(night.chromium, night.port, scheme=scheme) as page:
+    async with a_page(night.chromium, night.port) as page:
         await page.get_by_role("button", name="Look at it and clear").click()
+        await page.evaluate(AXE_SCRIPT)
         for view in VIEWS:
             await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
             await page.wait_for_timeout(800)
-            found = await Axe().run(page)
-            assert [
-                (each["id"], [node["html"] for node in each["nodes"]]) for each in found.response["violations"]
-            ] == [], view
+            light = await page.evaluate(AXE)
+            assert light["violations"] == [], view
+            assert "color-contrast" in light["colour"]
+            await page.emulate_media(color_scheme="dark")
+            dark = await page.evaluate(AXE, light["colour"])
+            assert dark["violations"] == [], f"{view}, dark"
+            await page.emulate_media(color_scheme="light")

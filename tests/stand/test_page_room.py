@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import shutil
 import urllib.error
 import urllib.parse
@@ -69,6 +70,15 @@ async def test_the_page_is_whole_and_lets_nothing_in_from_elsewhere(night):
     assert all("http://" not in path.read_text().replace("http://www.w3.org/2000/svg", "") for path in own)
     assert all("https://" not in path.read_text() for path in own)
     assert all("innerHTML" not in path.read_text() for path in own)
+
+
+async def test_the_dark_changes_colours_only():
+    """So axe's rules of colour are the only ones that are asked twice."""
+    style = (PAGE / "page.css").read_text("utf-8")
+    assert style.count("prefers-color-scheme") == 1
+    (dark,) = re.findall(r"@media \(prefers-color-scheme: dark\) \{\s*:root \{([^{}]*)\}\s*\}", style)
+    declared = [each.strip() for each in dark.split(";") if each.strip()]
+    assert [each for each in declared if not re.fullmatch(r"--[\w-]+: #[0-9a-f]{6}", each)] == []
 
 
 async def test_each_reason_to_hold_has_its_words():
