@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-CHROMIUM = __import__("os").environ.get("XCHROM") or shutil.which("chromium") or ""
+# The shell is the same browser without what no test looks at, and takes a third of the processor time.
+CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium") or ""
 needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no chromium is installed (apt-get install chromium)")
 ARGUMENTS = (
     "--no-sandbox",
@@ -17,7 +18,6 @@ ARGUMENTS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    *__import__("os").environ.get("XARGS", "").split(),
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 )
 DESKTOP, PHONE = (1440, 980), (390, 844)
