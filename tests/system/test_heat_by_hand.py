@@ -1,0 +1,72 @@
+"""Heat that an operator orders between runs: it goes on over midnight, and is told while the regulator is not read."""
+
+import asyncio
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from foundation.clock import WallClock
+from foundation.hub import Hub
+from foundation.items import Batch, Event
+from foundation.readings import bad_reading
+from recording.reading.session import Session
+from stand.config.stand_config import load_config, packaged
+from stand.daemon.daemon import Daemon
+from stand.daemon.daemon_desk import DaemonDesk
+from stand.daemon.day_record import DayRecord
+from stand.daemon.serve import serve as serve_stand
+from stand.serving.desk import Who
+from tests.system.test_daemon import LIMIT_S
+
+
+async def test_midnight_changes_the_record_beneath_heat_by_hand(
+    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
+    texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    day = ["20261122"]
+    monkeypatch.setattr(DayRecord, "_today", lambda _: day[0])
+    reported: list[Event] = []
+
+    @asynccontextmanager
+    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+        daemon: Daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
+
+        async def until(wanted: Callable[[], bool]) -> None:
+            async with asyncio.timeout(LIMIT_S):
+                while not wanted():
+                    await asyncio.sleep(0.02)
+
+        async def work() -> None:
+            hub.subscribe(lambda item: reported.append(item) if isinstance(item, Event) else None)
+            await desk.device(who, "regulator", "set", {"setpoint_degC": 40.0})
+            await until(lambda: desk.state().heater_permitted)
+            day[0] = "20261123"
+            await until(lambda: daemon.record.is_of_today())
+            turned_ns = clock.now_ns()
+            await until(lambda: clock.now_ns() > turned_ns + 3_000_000_000)  # the guard looks each second
+            assert desk.state().heater_permitted
+            assert desk.state().fault is None
+            by_hand, now_ns = desk.state().by_hand, clock.now_ns()
+            hub.publish(Batch("regulator", now_ns, (bad_reading("regulator.running", "1", now_ns, "no answer"),)))
+            assert (desk.state().setpoint_degC, desk.state().by_hand) == (None, by_hand)  # its wire is gone
+            await until(lambda: desk.state().setpoint_degC == 40.0)
+            assert desk.state().by_hand == by_hand is not None
+            assert daemon.open_stand.recorder is daemon.record.recorder
+
+        working = asyncio.create_task(work())
+        working.add_done_callback(lambda _: daemon.leave())
+        yield
+        await working
+
+    await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
+    # On a busy machine a poll may take longer than its period.
+    assert {event.kind for event in reported if event.level != "info"} <= {"device_slow"}
+    first, second = (
+        Session.open(out / f"{name}-house").readings("regulator.pv")[0] for name in ("20261122", "20261123")
+    )
+    assert len(first) > 0
+    assert len(second) > 0
+    assert 0 < (second[0] - first[-1]) / 1e9 < 2.0  # of a poll each half second none is missing
