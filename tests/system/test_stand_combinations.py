@@ -170,13 +170,14 @@ def pairwise() -> Iterator[Combination]:
     """Few combinations that have every pair of choices of two places: each begins with one that none had yet, and takes
     what adds the most."""
     places = tuple(PLACES.values())
-    left = {
+    left: set[frozenset[tuple[int, str]]] = {
         frozenset({(i, a.name), (j, b.name)})
         for (i, first), (j, second) in itertools.combinations(enumerate(places), 2)
         for a, b in itertools.product(first, second)
     }
     while left:
-        taken = dict(sorted(min(left, key=sorted)))
+        first_pair: list[tuple[int, str]] = min(map(sorted, left))
+        taken = dict(first_pair)
         for place, choices in enumerate(places):
             if place not in taken:
                 seen = tuple(taken.items())
