@@ -11,8 +11,10 @@ export PYTHONDONTWRITEBYTECODE :=
 BIN := $(VENV)/bin
 # Tests wait two thirds of their time, for real clocks and other processes.
 WORKERS := $(shell workers=$$(($$(nproc) * 3)); echo $$((workers < 12 ? workers : 12)))
+# MB that pyright's new objects may take: its garbage is collected less often, which saves 4 % of its processor time.
+CHECKER_OPTIONS := --max-semi-space-size=128
 RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
-PEER_PACKAGES := aravis-tools-cli aravis-tools chromium gcc libc6-dev
+PEER_PACKAGES := aravis-tools-cli aravis-tools chromium-headless-shell gcc libc6-dev
 
 .PHONY: setup demo test nightly bench benchmark clean
 
@@ -27,7 +29,7 @@ test: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
-	@$(BIN)/pyright & types=$$!; $(BIN)/pytest -n $(WORKERS); tests=$$?; \
+	@NODE_OPTIONS=$(CHECKER_OPTIONS) $(BIN)/pyright & types=$$!; $(BIN)/pytest -n $(WORKERS); tests=$$?; \
 		wait $$types || { echo "pyright has found errors, see above"; exit 1; }; exit $$tests
 
 nightly: setup

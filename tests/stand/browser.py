@@ -11,7 +11,7 @@ import pytest
 
 # The shell is the same browser without what no test looks at, and takes a third of the processor time.
 CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium") or ""
-needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no chromium is installed (apt-get install chromium)")
+needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no Chromium: apt-get install chromium-headless-shell")
 ARGUMENTS = (
     "--no-sandbox",
     "--disable-gpu",
