@@ -14,6 +14,7 @@ Sources: E5CC manual H174 (proportional bands, dead band, cooling band, alpha 0.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 DERIVATIVE_FILTER = 8.0  # Td over the time constant of the derivative's own lag
 
@@ -38,9 +39,8 @@ class Gains:
     alpha: float = 0.65
 
 
-@dataclass(frozen=True, slots=True)
-class PidState:
-    """What one step leaves for the next."""
+class PidState(NamedTuple):
+    """What one step leaves for the next; a tuple, because one is made at every step of the plant."""
 
     reference_degC: float
     integral_K: float
@@ -49,8 +49,7 @@ class PidState:
     demand_K: float
 
 
-@dataclass(frozen=True, slots=True)
-class Outputs:
+class Outputs(NamedTuple):
     """Manipulated values, %; both at once only with an overlapping (negative) dead band."""
 
     heat_pct: float
@@ -116,13 +115,10 @@ def on_time_ns(begin_ns: int, end_ns: int, duty: float, period_ns: int) -> int:
 
     Times are counted from the begin of the first period, duty is 0..1.
     """
-
-    def conducted_ns(until_ns: int) -> int:
-        periods, into_ns = divmod(until_ns, period_ns)
-        return periods * on_ns + min(into_ns, on_ns)
-
     on_ns = round(min(1.0, max(0.0, duty)) * period_ns)
-    return conducted_ns(end_ns) - conducted_ns(begin_ns)
+    periods, into_ns = divmod(begin_ns, period_ns)
+    last, last_into_ns = divmod(end_ns, period_ns)
+    return (last - periods) * on_ns + min(last_into_ns, on_ns) - min(into_ns, on_ns)
 
 
 def _lag(value: float, target: float, dt_s: float, time_constant_s: float) -> float:

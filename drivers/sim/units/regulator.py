@@ -86,12 +86,11 @@ class FakeRegulator:
     stuck_pv_degC (the PV stays there); pv_offset_K (the probe reads wrong); pv_drift_K_per_h; probe_out (the probe was
     pulled out of the chamber); probe_exchanged (with the thermometer near the camera); display_decimals other than 1;
     setpoint_clamp_degC (a set point is acknowledged but stored inside these limits).
-    eeprom_writes counts worn cells. alpha: set-point filter coefficient, set on the panel.
+    eeprom_writes counts worn cells.
     """
 
     def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
         self.unit = unit
-        self.alpha = 0.65
         self.eeprom_writes = 0
         self.silent = False
         self.compoway = False
@@ -202,6 +201,7 @@ class FakeRegulator:
             low, high = self.setpoint_clamp_degC
             value = min(high, max(low, value))
         self._ram[address] = value
+        self._gains = self._tuning()
         if keep:
             self._eeprom[address] = value
             self.eeprom_writes += 1
@@ -257,7 +257,7 @@ class FakeRegulator:
 
     def _automatic(self) -> None:
         if Mode.MANUAL in self._modes and Mode.STOP not in self._modes:
-            self._pid = resume(self.outputs, self._ram[SETPOINT], self._pv_degC(), self._gains())
+            self._pid = resume(self.outputs, self._ram[SETPOINT], self._pv_degC(), self._gains)
         self._modes.discard(Mode.MANUAL)
 
     def _save(self) -> None:
@@ -273,6 +273,7 @@ class FakeRegulator:
 
     def _power_up(self) -> None:
         self._ram = dict(self._eeprom)
+        self._gains = self._tuning()
         self._modes = {Mode.STOP}
         self._pid: PidState | None = None
         self.outputs = OFF
@@ -334,8 +335,12 @@ class FakeRegulator:
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         self._feel(dt_s)
         self.outputs = self._control(dt_s)
+        heat_pct = self.outputs.heat_pct
+        if heat_pct <= 0:
+            self._plant.heater_on_fraction = 0.0
+            return
         dt_ns = seconds_ns(dt_s)
-        on_ns = on_time_ns(time_ns, time_ns + dt_ns, self.outputs.heat_pct / 100, self._period_ns(HEAT_PERIOD))
+        on_ns = on_time_ns(time_ns, time_ns + dt_ns, heat_pct / 100, self._period_ns(HEAT_PERIOD))
         self._plant.heater_on_fraction = on_ns / dt_ns
 
     def _control(self, dt_s: float) -> Outputs:
@@ -350,7 +355,7 @@ class FakeRegulator:
         if Mode.TUNING in self._modes:
             self._pid = None
             return self._tuned(pv_degC - self._ram[SETPOINT])
-        outputs, self._pid = step(self._pid or start(pv_degC), self._ram[SETPOINT], pv_degC, dt_s, self._gains())
+        outputs, self._pid = step(self._pid or start(pv_degC), self._ram[SETPOINT], pv_degC, dt_s, self._gains)
         return outputs
 
     def _tuned(self, error_K: float) -> Outputs:
@@ -377,13 +382,12 @@ class FakeRegulator:
         low_degC, high_degC = PT100_RANGE_DEGC
         return high_degC if self.sensor_break else min(high_degC, max(low_degC, self._pv_degC()))
 
-    def _gains(self) -> Gains:
+    def _tuning(self) -> Gains:
         ram = self._ram
         return Gains(
             heat=Side(ram[HEAT_BAND], ram[HEAT_INTEGRAL], ram[HEAT_DERIVATIVE], ram[MV_UPPER]),
             cool=Side(ram[COOL_BAND], ram[COOL_INTEGRAL], ram[COOL_DERIVATIVE], -ram[MV_LOWER]),
             dead_band_K=ram[DEAD_BAND],
-            alpha=self.alpha,
         )
 
     def _period_ns(self, address: int) -> int:
