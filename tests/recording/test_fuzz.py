@@ -44,7 +44,7 @@ INPUTS = 10_000
 SALVAGES = 1000
 VERIFICATIONS = 1000
 # Seed, and what part of a round of the night is tried.
-PARTS = [(0, 5), *(pytest.param(seed, 1, marks=pytest.mark.nightly) for seed in range(ROUNDS // 4))]
+PARTS = [(0, 10), *(pytest.param(seed, 1, marks=pytest.mark.nightly) for seed in range(ROUNDS // 4))]
 
 
 class TooSlow(BaseException):
@@ -251,7 +251,7 @@ def test_what_is_salvaged_was_recorded_and_nothing_else(sound, tmp_path, seed, p
     assert recovered > SALVAGES // ROUNDS // part * expected.total() / 2
 
 
-@pytest.mark.parametrize("part", [5, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("part", [10, pytest.param(1, marks=pytest.mark.nightly)])
 def test_salvage_of_wrong_content_under_right_crcs_gives_data_or_a_sentence(sound, tmp_path, part):
     rng = Random(300)
     with limits():
@@ -268,7 +268,7 @@ def test_salvage_of_wrong_content_under_right_crcs_gives_data_or_a_sentence(soun
             shutil.rmtree(directory)
 
 
-@pytest.mark.parametrize("part", [5, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("part", [10, pytest.param(1, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("mutations", [(mutate_bytes, mutate_field, mutate_order), (mutate_inside,)])
 def test_verify_and_overview_answer_whatever_a_segment_holds(sound, tmp_path, mutations, part):
     """Damage is part of their answer, and what verify does not find is harmless."""

@@ -85,7 +85,7 @@ def test_a_run_is_not_held_up_by_what_somebody_left_beside_its_sessions(session:
     "text",
     [
         "name: 2026-99-99\n",
-        "name: " + "[" * 100_000,
+        "name: " + "[\n" * 100_000,
         "a: &a [1,1,1,1,1,1,1,1,1,1]\n"
         + "".join(f"{n}: &{n} [{','.join([f'*{p}'] * 10)}]\n" for p, n in zip("abcdefgh", "bcdefghi", strict=True)),
         "name: !!python/object:os.system x\n",

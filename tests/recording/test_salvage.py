@@ -22,7 +22,7 @@ from tests.recording.damage import (
     write_segment,
 )
 
-TRIALS = [30, by_night(1000)]
+TRIALS = [15, by_night(1000)]
 """Places at which a file is damaged, by day and by night."""
 SERIES = [TELEMETRY, FRAMES]
 
@@ -44,7 +44,7 @@ def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, serie
         assert done.kept is None or done.kept.read_bytes() == data
 
 
-@pytest.mark.parametrize("trials", [15, by_night(300)])
+@pytest.mark.parametrize("trials", [8, by_night(300)])
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)
 def test_a_finished_segment_that_is_damaged_is_salvaged_and_kept(damaged, night, series, damage, trials):

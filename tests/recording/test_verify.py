@@ -80,12 +80,13 @@ def everything(directory):
         return None
 
 
-async def test_one_flipped_bit_anywhere_is_found_or_changes_nothing(session):
+@pytest.mark.parametrize("trials", [80, by_night(400)])
+async def test_one_flipped_bit_anywhere_is_found_or_changes_nothing(session, trials):
     whole = everything(session)
     randomly = random.Random(5)
     files = [path for path in sorted(session.rglob("*")) if path.is_file()]
     harmless = 0
-    for _ in range(200):
+    for _ in range(trials):
         path = randomly.choice(files)
         data = path.read_bytes()
         place = randomly.randrange(len(data))
@@ -96,11 +97,11 @@ async def test_one_flipped_bit_anywhere_is_found_or_changes_nothing(session):
                 assert everything(session) == whole, f"byte {place} of {path} was not found"
         finally:
             path.write_bytes(data)
-    assert harmless < 10  # the text of the header, and bits that zstd ignores
+    assert harmless < trials / 20  # the text of the header, and bits that zstd ignores
     assert errors(session) == []
 
 
-@pytest.mark.parametrize("every", [7, by_night(1)])
+@pytest.mark.parametrize("every", [13, by_night(1)])
 async def test_every_byte_is_guarded_but_the_name_of_the_writers_library(tmp_path, every):
     directory = await recorded(tmp_path / "s", seconds=1)
     path = directory / "frames" / "0000.mcap"  # not compressed: zstd has bits that mean nothing

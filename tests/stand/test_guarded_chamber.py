@@ -10,6 +10,7 @@ from foundation.documents import parse_document
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.fault import Fault
 from stand.guarding.rules import Announcements, watches
+from tests.nightly import by_night
 from tests.stand.guarded_chamber import Action, Chamber, timed
 from tests.stand.guarded_failures import FAILURES, HARMLESS, PHASES, Night, Outcome, table
 from tests.stand.guarded_recipes import RECIPES, Player
@@ -46,13 +47,13 @@ def objections(chamber: Chamber, actions: Iterable[tuple[float, Action]], config
     return [fault for fault in found if fault.rule != "flap_open"]  # nobody announces captures here
 
 
-def big_steps() -> Iterable[tuple[float, Action]]:
+def big_steps(set_points_degC: Iterable[float] = BIG_STEPS_DEGC) -> Iterable[tuple[float, Action]]:
     """One hour at each."""
 
     def at(degC: float) -> Action:
         return lambda chamber: chamber.start(degC)
 
-    return [(3600.0, at(degC)) for degC in BIG_STEPS_DEGC]
+    return [(3600.0, at(degC)) for degC in set_points_degC]
 
 
 def check(found: Outcome, failure: str) -> None:
@@ -104,9 +105,10 @@ def test_so_it_does_in_every_failure_without_a_thermometer_in_the_granite(phase:
                 check(outcome, failure)
 
 
-def test_a_good_day_without_a_thermometer_in_the_granite_is_left_alone():
+@pytest.mark.parametrize("set_points_degC", [BIG_STEPS_DEGC[1:4], by_night(BIG_STEPS_DEGC)])
+def test_a_good_day_without_a_thermometer_in_the_granite_is_left_alone(set_points_degC: tuple[float, ...]):
     chamber = Chamber(1, camera_powered=False, channels={"air": 3})
-    assert objections(chamber, big_steps(), ALONE) == []
+    assert objections(chamber, big_steps(set_points_degC), ALONE) == []
 
 
 @pytest.mark.nightly
@@ -124,7 +126,7 @@ def test_the_air_stays_below_its_limit_in_every_failure(
     record_property("outcome", table(found))
 
 
-@pytest.mark.parametrize(("recipe", "chamber_seed"), [("calibration", 6), ("warm-up", 2)])
+@pytest.mark.parametrize(("recipe", "chamber_seed"), [("calibration", 6), by_night("warm-up", 2)])
 def test_a_good_night_is_left_alone(recipe: str, chamber_seed: int):
     assert objections(Chamber(chamber_seed), Player(recipe, interrupted=True).actions()) == []
 

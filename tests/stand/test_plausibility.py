@@ -122,14 +122,28 @@ def faults_of(night: Night) -> list[tuple[float, Fault]]:
     "night",
     [
         by_night(Night([24, 60, -10, 52, 10, 24], 3600)),
-        Night([30, 24, 45, 10, 60, 20, 50, 31, 34, 24], 900),
-        Night([24, 55, 24, 40], 2700, compressor_always=True),
+        Night([30, 24, 45, 10, 60, 20], 900),
+        by_night(Night([30, 24, 45, 10, 60, 20, 50, 31, 34, 24], 900)),
+        Night([24, 55, 24], 2700, compressor_always=True),
+        by_night(Night([24, 55, 24, 40], 2700, compressor_always=True)),
         by_night(Night([-10, 60, 0], 3600, laboratory_degC=32)),
         by_night(Night([60, -10, 60], 3600, laboratory_degC=10)),
-        Night([10], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None),
+        Night([10], 9000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None),
+        by_night(Night([10], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
         by_night(Night([52], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
     ],
-    ids=["far", "fast", "compressor fights", "hot laboratory", "cold laboratory", "warming up", "cooling down"],
+    ids=[
+        "far",
+        "fast",
+        "fast for long",
+        "compressor fights",
+        "compressor fights for long",
+        "hot laboratory",
+        "cold laboratory",
+        "warming up",
+        "warming up for long",
+        "cooling down",
+    ],
 )
 def test_a_good_night_trips_nothing_and_warns_of_nothing(night: Night):
     assert faults_of(night) == []

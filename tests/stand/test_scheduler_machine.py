@@ -312,7 +312,7 @@ def runs_of(examples: int, *, derandomize: bool) -> settings:
 
 
 TestRunMachine = RunMachine.TestCase
-TestRunMachine.settings = runs_of(80, derandomize=True)
+TestRunMachine.settings = runs_of(40, derandomize=True)
 
 
 @pytest.mark.nightly
