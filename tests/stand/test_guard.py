@@ -1,46 +1,16 @@
 """What the guard does when a rule objects; the rules and the stand's wires have tests of their own."""
 
 import asyncio
-import os
-import select
-import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from foundation.clock import Clock, VirtualClock, WallClock, block_until, seconds_ns
-from foundation.errors import DeviceFault
-from foundation.hub import Hub
-from foundation.items import Batch, Event
+from foundation.clock import VirtualClock, WallClock, block_until, seconds_ns
+from foundation.items import Batch
 from foundation.readings import Reading
-from stand.fault import Fault, Readings
-from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Rule, Watch
-from stand.guarding.notify import Notifier
-from stand.guarding.notify_process import run_command
-from stand.safety import Safety
-
-
-class PlainActuator:
-    """Writes down that it was made safe, or does not confirm it."""
-
-    name = "relays"
-
-    def __init__(self, log: list[str]) -> None:
-        self.log = log
-        self.failure = ""
-
-    async def make_safe(self) -> None:
-        await asyncio.sleep(0)
-        self.log.append("safe")
-        if self.failure:
-            raise DeviceFault(self.name, self.failure)
-
-
-NOTIFIERS: list[Notifier] = []  # of the test
+from stand.fault import Fault
+from tests.stand.guard_bench import NOTIFIERS, Bench
 
 
 @pytest.fixture(autouse=True)
@@ -48,64 +18,6 @@ def _ended_notifiers() -> Iterator[None]:
     yield
     while NOTIFIERS:
         NOTIFIERS.pop().close()
-
-
-class Bench:
-    """A guard over rules whose objections a test switches."""
-
-    def __init__(
-        self,
-        *actions: Any,
-        can_hold: bool = True,
-        command: tuple[str, ...] = (),
-        limit_s: float = 5.0,
-        clock: Clock | None = None,
-    ) -> None:
-        self.log: list[str] = []
-        self.events: list[Event] = []
-        self.clock = clock or VirtualClock(0)
-        self.broken: Exception | None = None  # what the rules raise
-        self.objecting: set[int] = set()
-        self.actuator = PlainActuator(self.log)
-        self.hub = hub = Hub()
-        self.safety = Safety(lambda: self.log.append("revoke"), hub, self.clock)
-        self.safety.take(self.actuator, 60.0)
-        hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
-        watches = tuple(Watch(self._rule(index), 0.0, action) for index, action in enumerate(actions))
-        stop, hold = (lambda fault, name=name: self.log.append(f"{name} {fault.rule}") for name in ("stop", "hold"))
-        notifier = Notifier(command, limit_s, self.clock)
-        NOTIFIERS.append(notifier)
-        self.guard = Guard(
-            self.safety,
-            watches,
-            hub,
-            self.clock,
-            1.0,
-            stop,
-            hold if can_hold else None,
-            lambda: self.log.append("release"),
-            notifier=notifier,
-        )
-
-    def _rule(self, index: int) -> Rule:
-        def rule(readings: Readings, now_ns: int) -> Fault | None:
-            if self.broken is not None:
-                raise self.broken
-            return Fault(f"rule{index}", "it is so") if index in self.objecting else None
-
-        return rule
-
-    async def run_for(self, duration_s: float) -> bool:
-        """Let the guard watch for a while; whether it still does."""
-        time = asyncio.create_task(self.clock.run())
-        watching = asyncio.create_task(self.guard.run())
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
-        still = not watching.done()
-        await self.guard.notified()
-        for task in (watching, time):
-            task.cancel()
-        await asyncio.gather(watching, time, return_exceptions=True)
-        return still
 
 
 async def test_permits_may_be_renewed_while_every_rule_holds_and_the_guard_looks():
@@ -156,21 +68,6 @@ async def test_a_hold_that_is_not_confirmed_safe_is_made_safe_again_every_minute
     await bench.run_for(130)
     assert bench.log == ["hold rule0", "revoke"] + ["safe"] * 4
     assert [event.kind for event in bench.events] == ["guard.rule0", "not_confirmed_safe", "confirmed_safe"]
-
-
-async def test_a_guard_that_fails_aborts_makes_safe_and_tells(tmp_path: Path, script: Callable[[str], str]):
-    reported = tmp_path / "reported"
-    bench = Bench("hold", command=(script(f'printf "%s" "$1" > {reported}'),))
-    bench.broken = KeyError("channel")
-    time = asyncio.create_task(bench.clock.run())
-    with pytest.raises(KeyError):
-        await bench.guard.run()
-    await bench.guard.notified()
-    time.cancel()
-    assert bench.log == ["stop guard_failed", "revoke", "safe"]
-    text = "the guard failed (KeyError: 'channel')"
-    assert [(event.level, event.kind, event.text) for event in bench.events] == [("error", "guard.guard_failed", text)]
-    assert reported.read_text() == text
 
 
 async def test_a_run_that_cannot_be_ended_does_not_keep_the_stand_from_being_made_safe():
@@ -404,92 +301,3 @@ async def test_a_warning_is_reported_when_it_begins_and_changes_nothing():
         assert bench.guard.look()
     assert bench.log == []
     assert [(event.level, event.kind) for event in bench.events] == [("warning", "guard.rule0")] * 2
-
-
-@pytest.fixture
-def script(tmp_path: Path) -> Callable[[str], str]:
-    """An executable shell script; what it is given is "$@"."""
-
-    def make(body: str) -> str:
-        path = tmp_path / "notify"
-        path.write_text(f"#!/bin/sh\n{body}\n")
-        path.chmod(path.stat().st_mode | stat.S_IXUSR)
-        return str(path)
-
-    return make
-
-
-async def test_a_command_gets_a_trip_as_one_argument(tmp_path: Path, script: Callable[[str], str]):
-    reported = tmp_path / "reported"
-    bench = Bench("hold", command=(script(f'printf "%s|" "$@" > {reported}'), "--to", "a b"))
-    bench.objecting = {0}
-    await bench.run_for(2)
-    assert reported.read_text() == "--to|a b|it is so|"
-    assert [event.kind for event in bench.events] == ["guard.rule0"]
-
-
-async def test_a_run_that_is_taken_down_waits_until_somebody_was_notified(tmp_path: Path, script: Callable[[str], str]):
-    """The guard ends at once, while the command still runs: it only can in real time."""
-    reported = tmp_path / "reported"
-    bench = Bench("abort", command=(script(f"sleep 0.3; touch {reported}; exit 3"),), clock=WallClock())
-    bench.objecting = {0}
-    watching = asyncio.create_task(bench.guard.run())
-    while bench.log[-1:] != ["safe"]:
-        await asyncio.sleep(0)
-    await asyncio.wait([watching])
-    assert not reported.exists()
-    await bench.guard.notified()
-    assert reported.exists()
-    assert [event.kind for event in bench.events] == ["guard.rule0", "notify_failed"]
-
-
-async def test_what_is_not_safe_is_reported_with_the_trip(tmp_path: Path, script: Callable[[str], str]):
-    reported = tmp_path / "reported"
-    bench = Bench("abort", command=(script(f'printf "%s" "$1" > {reported}'),))
-    bench.actuator.failure = "no answer"
-    bench.objecting = {0}
-    assert not bench.guard.look()
-    await bench.guard.notified()
-    unsafe = "relays did not confirm its safe state: relays: no answer"
-    assert reported.read_text() == f"it is so; NOT SAFE: {unsafe}"
-    await bench.safety.close()
-
-
-async def test_a_command_that_hangs_is_killed_and_an_event_while_the_hold_stands(script: Callable[[str], str]):
-    bench = Bench("hold", command=(script("exec sleep 600"),), limit_s=0.2)
-    bench.objecting = {0}
-    assert await bench.run_for(20)
-    assert bench.guard.held is not None
-    assert [event.kind for event in bench.events] == ["guard.rule0", "notify_failed"]
-    assert bench.events[1].text.endswith("notify did not end within 0.2 s")
-
-
-@pytest.mark.parametrize("command", ["/nowhere/tell", "no-such-program-here", "/dev/null"])
-async def test_a_command_that_cannot_be_run_is_reported_when_the_watch_begins(command: str):
-    bench = Bench("hold", command=(command,))
-    assert await bench.run_for(20)
-    assert [(event.level, event.kind) for event in bench.events] == [("warning", "notify_failed")]
-    assert bench.events[0].text.startswith(f"guard.notify: {command} is no program")
-
-
-async def test_a_command_that_fails_is_an_event_and_no_more(script: Callable[[str], str]):
-    bench = Bench("abort", command=(script("exit 7"),))
-    bench.objecting = {0}
-    assert not bench.guard.look()
-    await bench.guard.notified()
-    assert [(event.level, event.kind) for event in bench.events[1:]] == [("warning", "notify_failed")]
-    assert bench.events[1].text.endswith("notify ended with status 7")
-
-
-def test_a_command_that_does_not_exist_or_hangs_gives_a_sentence(tmp_path: Path, script: Callable[[str], str]):
-    assert "could not be started (" in run_command((str(tmp_path / "none"), "text"), 5.0)
-    assert run_command((script("true"), "text"), 5.0) == ""
-    os.mkfifo(pipe := tmp_path / "pipe")
-    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    try:
-        hanging = script(f"sleep 600 > {pipe} & wait")
-        assert run_command((hanging, "text"), 0.3).endswith("did not end within 0.3 s")
-        assert select.select([reader], [], [], 10.0)[0]  # nobody has the other end open: its child is gone, too
-        assert os.read(reader, 1) == b""
-    finally:
-        os.close(reader)

@@ -4,8 +4,6 @@ import asyncio
 import contextlib
 import json
 import os
-import shutil
-import signal
 import stat
 import subprocess
 import sys
@@ -15,14 +13,14 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import SessionError
-from stand.serving import presence as runtime
 from stand.serving.api.listening import MOST_CLIENTS
-from stand.serving.client import running_sessions, server_of
+from stand.serving.client import running_sessions
 from stand.serving.desk import RunStatus
-from stand.serving.presence import Entry, Presence, address_in, living, opened_folder
+from stand.serving.presence import address_in, living, opened_folder
 from tests import forked
 from tests.asking import ask, ask_status
-from tests.stand.a_desk import STAND, ADesk, served
+from tests.stand.a_desk import ADesk, served
+from tests.stand.interface_client import DAEMON, entries_of, obeys
 
 STATUS = RunStatus(
     recipe="thermal-cycle",
@@ -42,11 +40,6 @@ STATUS = RunStatus(
 
 HEALTH = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
 STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n\r\n"
-
-
-def entries_of(session: Path) -> list[Entry]:
-    """What the daemons that run `session` say of themselves; on this machine there may be others."""
-    return [each.entry for each in living() if each.entry.session == str(session)]
 
 
 async def connect(session: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
@@ -200,91 +193,10 @@ async def test_paths_longer_than_the_kernel_takes_are_served(tmp_path: Path, mon
     runtime.mkdir(parents=True)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     async with served(ADesk(), session):
-        assert await asyncio.to_thread(_answers, session)
+        assert await asyncio.to_thread(obeys, session)
         assert await asyncio.to_thread(running_sessions, session.parent) == [session]
     assert list(session.iterdir()) == []
     assert list((runtime / "thermostand").iterdir()) == []
-
-
-async def folder_stated(session: Path) -> None:
-    """Return when the daemon has said which folder it is, whatever its name."""
-    while not any(entry.identity for entry in entries_of(session)):
-        await asyncio.sleep(0.01)
-
-
-async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tmp_path: Path):
-    old, new = tmp_path / "sessions" / "old", tmp_path / "elsewhere" / "new"
-    old.mkdir(parents=True)
-    new.parent.mkdir()
-    (tmp_path / "link").symlink_to(old.parent)
-    async with served(ADesk(), old):
-        await folder_stated(old)
-
-        async def reached() -> list[object]:
-            """By which of the names it is reached, and what it is called in each folder."""
-            names = [old, new, tmp_path / "link" / "old", Path(os.path.relpath(old))]
-            found = [name for name in names if await asyncio.to_thread(_answers, name)]
-            roots = (old.parent, new.parent, tmp_path / "link")
-            return [found == names, *[await asyncio.to_thread(running_sessions, root) for root in roots]]
-
-        assert await reached() == [False, [old], [], [tmp_path / "link" / "old"]]
-        old.rename(new)
-        assert await reached() == [True, [old], [new], [tmp_path / "link" / "old"]]
-        new.rename(new.with_name("newer"))
-        assert await asyncio.to_thread(running_sessions, new.with_name("newer")) == [new.with_name("newer")]
-        shutil.rmtree(new.parent)
-        assert await asyncio.to_thread(_answers, old)
-        assert not await asyncio.to_thread(_answers, new)
-
-
-def _answers(session: Path) -> bool:
-    try:
-        return ask(session, "stop")["verb"] == "stop"
-    except SessionError:
-        return False
-
-
-async def test_two_daemons_with_one_name_are_distinguished_by_the_folder(tmp_path: Path):
-    """The first one's session was renamed, and the next run took its name."""
-    session, away = tmp_path / "night", tmp_path / "renamed"
-    session.mkdir()
-    async with served(ADesk("first"), session):
-        await folder_stated(session)
-        session.rename(away)
-        session.mkdir()
-        async with served(ADesk("second"), session):
-            while len([entry for entry in entries_of(session) if entry.identity]) < 2:
-                await asyncio.sleep(0.01)
-            assert (await asyncio.to_thread(server_of(away).state)).reasons == ("first",)
-            assert (await asyncio.to_thread(server_of(session).state)).reasons == ("second",)
-
-
-async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """As a logout does with $XDG_RUNTIME_DIR and all that is in it."""
-    runtime = tmp_path / "runtime"
-    runtime.mkdir()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    async with served(ADesk(), tmp_path), asyncio.timeout(30):
-        shutil.rmtree(runtime / "thermostand")
-        with pytest.raises(SessionError, match="no daemon is running"):
-            await asyncio.to_thread(ask, tmp_path, "stop")
-        while not await asyncio.to_thread(_answers, tmp_path):
-            await asyncio.sleep(0.05)
-    assert list((runtime / "thermostand").iterdir()) == []
-
-
-DAEMON = """
-import asyncio, sys
-from pathlib import Path
-from tests.stand.a_desk import ADesk, served
-
-async def run():
-    async with served(ADesk(), Path(sys.argv[1])):
-        print("ready", flush=True)
-        await asyncio.Event().wait()
-
-asyncio.run(run())
-"""
 
 
 @pytest.fixture
@@ -305,93 +217,6 @@ def daemon() -> Iterator[Callable[[Path], "subprocess.Popen[str]"]]:
         process.kill()
         process.wait()
         process.stdout.close()
-
-
-async def test_what_a_killed_daemon_left_is_nobodys_and_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, daemon: Callable[[Path], "subprocess.Popen[str]"]
-):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    runtime_folder = tmp_path / "thermostand"
-    process = daemon(tmp_path)
-    assert _answers(tmp_path)
-    (entry,) = entries_of(tmp_path)
-    assert (entry.session, entry.pid, entry.stand) == (str(tmp_path), process.pid, "a stand")
-    process.kill()
-    process.wait()
-    assert len(list(runtime_folder.iterdir())) == 2
-    with pytest.raises(SessionError, match="no daemon is running this session"):
-        ask(tmp_path, "stop")
-    assert list(runtime_folder.iterdir()) == []
-    assert running_sessions(tmp_path.parent) == []
-    async with served(ADesk(), tmp_path):
-        assert await asyncio.to_thread(_answers, tmp_path)
-
-
-def test_a_daemon_that_hangs_is_distinguished_from_a_missing_one(
-    tmp_path: Path, daemon: Callable[[Path], "subprocess.Popen[str]"]
-):
-    daemon(tmp_path).send_signal(signal.SIGSTOP)
-    with pytest.raises(SessionError, match=r"has not answered within 0\.2 s; it may hang"):
-        ask(tmp_path, "stop", timeout_s=0.2)
-
-
-async def test_a_runtime_folder_of_somebody_else_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    (tmp_path / "thermostand").symlink_to(tmp_path)
-    with pytest.raises(SessionError, match="is not a folder of this user; set XDG_RUNTIME_DIR"):
-        async with served(ADesk(), tmp_path):
-            pass
-    (tmp_path / "thermostand").unlink()
-    (tmp_path / "thermostand").write_text("mine")
-    with pytest.raises(SessionError, match="cannot be made"):
-        async with served(ADesk(), tmp_path):
-            pass
-    (tmp_path / "thermostand").unlink()
-    (tmp_path / "thermostand").mkdir(mode=0o755)
-    assert stat.S_IMODE(runtime.runtime_folder().stat().st_mode) == 0o700
-
-
-@pytest.mark.parametrize("named", ["", "relative", "/nonexistent"])
-def test_without_a_folder_of_the_login_the_systems_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str):
-    monkeypatch.setattr(runtime, "SYSTEM_FOLDER", tmp_path / "lock")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", named)
-    assert runtime.runtime_folder() == tmp_path / "lock"
-    assert (tmp_path / "lock").is_dir()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    assert runtime.runtime_folder() == tmp_path / "thermostand"
-    assert runtime.runtime_folders() == (tmp_path / "thermostand", tmp_path / "lock")  # daemons of both are found
-
-
-def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentence(tmp_path: Path):
-    for session in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(SessionError, match="no daemon is running this session"):
-            ask(session, "stop")
-
-
-@pytest.mark.parametrize(
-    ("said", "sentence"),
-    [
-        (b"", "ended before it answered"),
-        (b"HTTP/1.1 200 OK\r\ncontent-length: 100\r\n\r\n{", "sent an unknown reply"),
-        (b"hello\n", "sent an unknown reply"),
-        (b"HTTP/1.1 200 OK\r\n\r\n<html>", "sent an unknown reply"),
-        (b'HTTP/1.1 200 OK\r\n\r\n{"stand": 3}', "sent an unknown reply"),
-        (b"HTTP/1.1 409 Conflict\r\n\r\n[]", "sent an unknown reply"),
-    ],
-)
-async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: bytes, sentence: str):
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readuntil(b"\r\n\r\n")
-        writer.write(said)
-        writer.close()
-
-    presence = Presence(Entry(str(tmp_path), os.getpid(), STAND))
-    try:
-        async with await asyncio.start_unix_server(talk, sock=presence.appear()):
-            with pytest.raises(SessionError, match=sentence):
-                await asyncio.to_thread(ask_status, tmp_path)
-    finally:
-        presence.disappear()
 
 
 async def test_an_operator_holds_releases_clears_and_stops_the_run(tmp_path: Path):

@@ -1,22 +1,17 @@
 import asyncio
 import fcntl
 import json
-import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from foundation.items import Event
 from recording.reading.session import Session
-from stand.commands.sessions.session_commands import app
 from tests.recording.recorded import START_NS, half_second, item_key, record
-
-runner = CliRunner()
-COUNT = 12  # half seconds, a frame each
+from tests.stand.session_commands import COUNT, ask, refused
 
 
 @pytest.fixture(scope="module")
@@ -30,18 +25,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def session(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "sessions" / whole.name))
-
-
-def ask(*arguments: object, status: int = 0):
-    result = runner.invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == status, result.output
-    return result
-
-
-def refused(*arguments: object) -> str:
-    """The one line that says what is wrong with the arguments."""
-    (line,) = ask(*arguments, status=2).stderr.splitlines()
-    return line
 
 
 def flip(path: Path, marker: bytes, behind: int) -> None:
@@ -351,83 +334,3 @@ def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):
 def test_trim_refuses_times_that_are_none(session: Path, tmp_path: Path, times: tuple[str, ...], sentence: str):
     assert sentence in refused("trim", session, "--out", tmp_path / "part", *times)
     assert not (tmp_path / "part").exists()
-
-
-@pytest.mark.parametrize("command", ["info", "verify", "replay", "salvage"])
-def test_what_is_no_session_is_refused(tmp_path: Path, command: str):
-    (line,) = ask(command, tmp_path / "nowhere", status=2).stderr.splitlines()
-    assert line.startswith(f"error: {tmp_path / 'nowhere'}: ")
-
-
-USES = [("export", "--out"), ("trim", "--out"), ("replay", "--record")]
-
-
-@pytest.mark.parametrize(("command", "option"), USES)
-def test_what_was_not_finished_is_not_left_out_in_silence(session: Path, tmp_path: Path, command: str, option: str):
-    path = session / "frames" / "0001.mcap"
-    path.rename(path.with_name("0001.mcap.part"))
-    (line,) = ask(command, session, option, tmp_path / "new", status=1).stderr.splitlines()
-    assert line == (
-        f"error: {session}: frames/0001.mcap.part is not finished and would be left out; "
-        f"`stand session salvage {session}` first"
-    )
-    assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize(("command", "option"), USES)
-def test_of_a_session_being_recorded_what_is_finished_is_used(session: Path, tmp_path: Path, command: str, option: str):
-    path = session / "frames" / "0002.mcap"
-    part = path.rename(path.with_name("0002.mcap.part"))
-    speed = ("--speed", "max") if command == "replay" else ()
-    with part.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        result = ask(command, session, option, tmp_path / "new", *speed)
-    warning = (
-        f"warning: {session}: is being recorded; left out because they are not finished yet: frames/0002.mcap.part"
-    )
-    assert warning in result.stderr.splitlines()
-    assert (tmp_path / "new").is_dir()
-
-
-@pytest.mark.parametrize(("command", "option"), USES)
-@pytest.mark.parametrize("series", ["frames", "telemetry"])
-def test_a_command_that_meets_damage_says_that_a_salvage_helps(
-    session: Path, tmp_path: Path, series: str, command: str, option: str
-):
-    path = session / series / "0000.mcap"
-    data = bytearray(path.read_bytes())
-    data[len(data) * 2 // 5] ^= 1
-    path.write_bytes(data)
-    speed = ("--speed", "max") if command == "replay" else ()
-    line = ask(command, session, option, tmp_path / "new", *speed, status=1).stderr.splitlines()[-1]
-    assert line.startswith(f"error: {path}: ")
-    assert line.endswith(f"; `stand session salvage {session}` recovers what is sound")
-    assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize(("command", "option"), USES)
-def test_nothing_is_made_inside_a_session(session: Path, command: str, option: str):
-    out = session / "frames" / ".." / "part"
-    assert refused(command, session, option, out).endswith("part: is inside the session; choose a place outside of it")
-    assert not out.exists()
-
-
-@pytest.mark.parametrize("arguments", [("export", "--out"), ("trim", "--out"), ("replay", "--record")])
-def test_what_exists_is_not_overwritten(session: Path, tmp_path: Path, arguments: tuple[str, str]):
-    command, option = arguments
-    (tmp_path / "there").mkdir()
-    assert "there: exists already" in refused(command, session, option, tmp_path / "there")
-
-
-def test_text_in_a_recording_cannot_write_to_the_terminal(session: Path):
-    trick = session.rename(session.parent / "a\x1b[2Jb")
-    for command in (("list", session.parent), ("info", trick)):
-        output = ask(*command).output
-        assert "\x1b" not in output
-        assert "a\\x1b[2Jb" in output
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_a_file_that_may_not_be_read_is_reported(session: Path):
-    (session / "frames" / "0000.mcap").chmod(0)
-    assert "Permission" in ask("info", session).stdout

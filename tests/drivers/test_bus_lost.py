@@ -1,0 +1,156 @@
+"""Units that are dead, ports that are gone or taken, and connections that end."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from drivers.sim.faults import LinkFaults
+from drivers.sim.wire import PtyWire, TcpWire
+from drivers.wires.bus import Bus, BusSettings
+from foundation.clock import VirtualClock, WallClock, seconds_ns
+from foundation.errors import GarbledReply, Unreachable
+from tests.drivers.bus_responder import TIMEOUT_S, Responder, flip, frame, late, read_is_right
+
+
+class MbapResponder(Responder):
+    """The same behind a Modbus TCP gateway."""
+
+    def feed(self, data: bytes) -> bytes:
+        reply = super().feed(frame(data[6:]))
+        return data[:4] + (len(reply) - 2).to_bytes(2, "big") + reply[:-2] if reply else b""
+
+
+class NumberlessResponder(MbapResponder):
+    """Its replies have the transaction number 0, whatever was asked."""
+
+    def feed(self, data: bytes) -> bytes:
+        reply = super().feed(data)
+        return reply and bytes(2) + reply[2:]
+
+
+@pytest.fixture
+def responder() -> Responder:
+    return Responder()
+
+
+@pytest.fixture
+async def bus(responder: Responder, tmp_path: Path) -> AsyncIterator[Bus]:
+    wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S, gap_s=0.0), WallClock())
+    await bus.open()
+    yield bus
+    await bus.close()
+    wire.close()
+
+
+async def test_a_dead_unit_is_skipped_and_probed_at_growing_intervals_and_the_other_keeps_going(
+    responder: Responder, tmp_path: Path
+) -> None:
+    clock = VirtualClock(0)
+    driver = asyncio.create_task(clock.run())
+    wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S), clock)
+    await bus.open()
+    responder.silent_units = {2}
+    asked: list[int] = []
+    for second in range(24):
+        await clock.sleep_until(seconds_ns(second))
+        before = len(responder.requests)
+        with pytest.raises(Unreachable):
+            await read_is_right(bus, 0, unit=2)
+        asked.append(len(responder.requests) - before)
+        assert await read_is_right(bus, 0, unit=1)
+    assert [second for second, count in enumerate(asked) if count] == [0, 1, 2, 3, 5, 9, 17]  # then every 10 s
+    assert sum(asked) == 3 + 6
+    assert bus.counters.skipped == 17
+    with pytest.raises(Unreachable):  # a write is never withheld
+        await bus.write_coil("relays", 2, 0, 0)
+    responder.silent_units = set()
+    await clock.sleep_until(seconds_ns(40))
+    assert await read_is_right(bus, 0, unit=2)
+    assert await read_is_right(bus, 6, unit=2)
+    driver.cancel()
+    await bus.close()
+    wire.close()
+
+
+async def test_a_unit_whose_last_reply_was_garbled_is_alive_and_asked_again_as_often(
+    bus: Bus, responder: Responder
+) -> None:
+    """As after a write whose reply was garbled: the next read must not fail at its first garbled reply."""
+    responder.fault = flip
+    with pytest.raises(GarbledReply):
+        await bus.write_coil("dut", 1, 3, 0xFF00)
+    responder.fault = flip
+    assert await read_is_right(bus, 100)
+
+
+async def test_unplugged_and_replugged_it_works_again_within_two_seconds(responder: Responder, tmp_path: Path) -> None:
+    clock = VirtualClock(0)
+    driver = asyncio.create_task(clock.run())
+    wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S), clock)
+    await bus.open()
+    assert await read_is_right(bus, 100)
+    wire.close()
+    for _ in range(3):
+        with pytest.raises(Unreachable, match="rs485"):
+            await read_is_right(bus, 100)
+    wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
+    await clock.sleep_until(seconds_ns(2))
+    assert await read_is_right(bus, 100)
+    assert bus.counters.lines_down > 0
+    driver.cancel()
+    await bus.close()
+    wire.close()
+
+
+async def test_over_tcp_a_late_reply_dies_with_its_connection_and_a_hang_up_costs_nothing() -> None:
+    responder = MbapResponder()
+    wire = TcpWire("127.0.0.1", 0, lambda: responder, LinkFaults())
+    bus = Bus("gateway", BusSettings(address=f"tcp:127.0.0.1:{wire.port}", timeout_s=TIMEOUT_S), WallClock())
+    await bus.open()
+    responder.fault = late
+    assert await read_is_right(bus, 100)
+    assert await read_is_right(bus, 200)
+    assert bus.counters.silences == 1
+    port = wire.port
+    wire.close()
+    wire = TcpWire("127.0.0.1", port, lambda: responder, LinkFaults())
+    assert await read_is_right(bus, 300)
+    assert bus.counters.lines_down == 1
+    wire.close()
+    with pytest.raises(Unreachable, match="cannot open tcp:127"):
+        await read_is_right(bus, 400)
+    await bus.close()
+
+
+async def test_over_tcp_a_reply_without_the_number_of_its_request_is_no_reply() -> None:
+    wire = TcpWire("127.0.0.1", 0, NumberlessResponder, LinkFaults())
+    bus = Bus("gateway", BusSettings(address=f"tcp:127.0.0.1:{wire.port}", timeout_s=TIMEOUT_S), WallClock())
+    await bus.open()
+    with pytest.raises(GarbledReply):
+        await bus.write_coil("dut", 1, 3, 0xFF00)
+    await bus.close()
+    wire.close()
+
+
+async def test_a_second_opener_learns_that_the_port_is_taken(bus: Bus) -> None:
+    other = Bus("other", BusSettings(address=bus.address), WallClock())
+    with pytest.raises(Unreachable, match="another program has it open"):
+        await other.open()
+    await other.close()
+
+
+async def test_a_missing_port_and_a_bus_not_open_say_so(tmp_path: Path) -> None:
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'none'}"), WallClock())
+    with pytest.raises(Unreachable, match="not open"):
+        await bus.read("dut", 1, "holding", 0, 1)
+    with pytest.raises(Unreachable, match="No such file"):
+        await bus.open()
+    await bus.close()
+    await bus.close()

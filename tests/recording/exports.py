@@ -1,0 +1,32 @@
+"""Exports of a recorded session, and their tables as they are read back."""
+
+import csv
+
+import pyarrow.parquet
+
+from recording.exporting.export import export
+from recording.format.images import ImageEncoding
+from recording.reading.session import Session
+from tests.recording.recorded import half_second, record
+
+
+def silent(done, text):
+    pass
+
+
+def csv_rows(path):
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def parquet_rows(path):
+    table = pyarrow.parquet.read_table(path)
+    return table.select([name for name in table.column_names if name != "time_utc"]).to_pylist()  # datetime has no ns
+
+
+async def exported(tmp_path, *, count=12, items=half_second, encoding: ImageEncoding = "png", **choices):
+    """The recorded session, and the folder it was exported to."""
+    await record(tmp_path / "s", count, items, encoding)
+    session = Session.open(tmp_path / "s")
+    export(session, tmp_path / "out", report=silent, **choices)
+    return session, tmp_path / "out"

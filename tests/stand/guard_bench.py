@@ -1,0 +1,91 @@
+"""A guard over rules whose objections a test switches."""
+
+import asyncio
+from typing import Any
+
+from foundation.clock import Clock, VirtualClock, seconds_ns
+from foundation.errors import DeviceFault
+from foundation.hub import Hub
+from foundation.items import Event
+from stand.fault import Fault, Readings
+from stand.guarding.guard import Guard
+from stand.guarding.interlocks import Rule, Watch
+from stand.guarding.notify import Notifier
+from stand.safety import Safety
+
+
+class PlainActuator:
+    """Writes down that it was made safe, or does not confirm it."""
+
+    name = "relays"
+
+    def __init__(self, log: list[str]) -> None:
+        self.log = log
+        self.failure = ""
+
+    async def make_safe(self) -> None:
+        await asyncio.sleep(0)
+        self.log.append("safe")
+        if self.failure:
+            raise DeviceFault(self.name, self.failure)
+
+
+NOTIFIERS: list[Notifier] = []  # of the test
+
+
+class Bench:
+    """A guard over rules whose objections a test switches."""
+
+    def __init__(
+        self,
+        *actions: Any,
+        can_hold: bool = True,
+        command: tuple[str, ...] = (),
+        limit_s: float = 5.0,
+        clock: Clock | None = None,
+    ) -> None:
+        self.log: list[str] = []
+        self.events: list[Event] = []
+        self.clock = clock or VirtualClock(0)
+        self.broken: Exception | None = None  # what the rules raise
+        self.objecting: set[int] = set()
+        self.actuator = PlainActuator(self.log)
+        self.hub = hub = Hub()
+        self.safety = Safety(lambda: self.log.append("revoke"), hub, self.clock)
+        self.safety.take(self.actuator, 60.0)
+        hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
+        watches = tuple(Watch(self._rule(index), 0.0, action) for index, action in enumerate(actions))
+        stop, hold = (lambda fault, name=name: self.log.append(f"{name} {fault.rule}") for name in ("stop", "hold"))
+        notifier = Notifier(command, limit_s, self.clock)
+        NOTIFIERS.append(notifier)
+        self.guard = Guard(
+            self.safety,
+            watches,
+            hub,
+            self.clock,
+            1.0,
+            stop,
+            hold if can_hold else None,
+            lambda: self.log.append("release"),
+            notifier=notifier,
+        )
+
+    def _rule(self, index: int) -> Rule:
+        def rule(readings: Readings, now_ns: int) -> Fault | None:
+            if self.broken is not None:
+                raise self.broken
+            return Fault(f"rule{index}", "it is so") if index in self.objecting else None
+
+        return rule
+
+    async def run_for(self, duration_s: float) -> bool:
+        """Let the guard watch for a while; whether it still does."""
+        time = asyncio.create_task(self.clock.run())
+        watching = asyncio.create_task(self.guard.run())
+        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        still = not watching.done()
+        await self.guard.notified()
+        for task in (watching, time):
+            task.cancel()
+        await asyncio.gather(watching, time, return_exceptions=True)
+        return still

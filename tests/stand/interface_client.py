@@ -1,0 +1,34 @@
+"""A client of a daemon's interface, by hand."""
+
+from pathlib import Path
+
+from foundation.errors import SessionError
+from stand.serving.presence import Entry, living
+from tests.asking import ask
+
+
+def entries_of(session: Path) -> list[Entry]:
+    """What the daemons that run `session` say of themselves; on this machine there may be others."""
+    return [each.entry for each in living() if each.entry.session == str(session)]
+
+
+def obeys(session: Path) -> bool:
+    """Whether a daemon that runs `session` takes a stop."""
+    try:
+        return ask(session, "stop")["verb"] == "stop"
+    except SessionError:
+        return False
+
+
+DAEMON = """
+import asyncio, sys
+from pathlib import Path
+from tests.stand.a_desk import ADesk, served
+
+async def run():
+    async with served(ADesk(), Path(sys.argv[1])):
+        print("ready", flush=True)
+        await asyncio.Event().wait()
+
+asyncio.run(run())
+"""
