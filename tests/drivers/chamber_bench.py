@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator
+import threading
+from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from pydantic import TypeAdapter
 
 from drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
@@ -17,9 +19,11 @@ from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, Fake
 from drivers.sim.units.julabo_circulator import FakeJulabo
 from drivers.sim.units.simserv_chamber import FakeSimserv
 from drivers.sim.wire import PtyWire, TcpWire
+from drivers.wires.line_client import LineClient
 from foundation.clock import FollowedClock, WallClock, seconds_ns
 from foundation.readings import Reading
 
+LIMIT_S = 60.0  # of what comes at once; a test that fails is not to hang
 START_NS = 1_700_000_000_000_000_000
 ALLOWED_DEGC = (-10.0, 60.0)
 MAKES = ("espec", "cts", "ascii2", "simserv", "julabo")
@@ -28,13 +32,59 @@ ON_WIRES = [(make, wire) for make in MAKES for wire in WIRES if (make, wire) != 
 SETTINGS: TypeAdapter[ChamberUnitSettings] = TypeAdapter(ClimateChamberSettings)
 
 
+class Sent(list[bytes]):
+    """Pieces of a reply, and what is called when the last has been written."""
+
+    def __init__(self, pieces: Iterable[bytes], then: Callable[[], None]) -> None:
+        super().__init__(pieces)
+        self._then = then
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield from super().__iter__()
+        self._then()
+
+
+class Held(LinkFaults):
+    """Faults, and a reply that comes when who asked has given up, and before it asks again: however busy the machine
+    is. `noticed` has a client tell when it gives up."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._is_held = False
+        self._given_up, self._sent = threading.Event(), threading.Event()
+
+    def hold(self) -> None:
+        """The next reply is too late."""
+        self._given_up.clear()
+        self._sent.clear()
+        self._is_held = True
+
+    def apply(self, request: bytes, reply: bytes) -> list[bytes]:
+        if not self._is_held:
+            return super().apply(request, reply)
+        assert self._given_up.wait(LIMIT_S)
+        self._is_held = False
+        return Sent([reply], self._sent.set)
+
+    def noticed(self, quarantine: Callable[[LineClient], None]) -> Callable[[LineClient], None]:
+        """The same, after which a reply that is held has come."""
+
+        def begins(client: LineClient) -> None:
+            is_held = self._is_held
+            quarantine(client)
+            self._given_up.set()
+            assert not is_held or self._sent.wait(LIMIT_S)
+
+        return begins
+
+
 class Bench:
     """A chamber of one make on its wire, the plant behind it, and its driver."""
 
     def __init__(self, make: str, wire: str, folder: Path, **settings: object) -> None:
         self.plant = Plant(PlantSpec(laboratory_swing_K=0.0), START_NS)
         self.clock = FollowedClock(START_NS)
-        self.faults = LinkFaults(seed=5)
+        self.faults = Held(seed=5)
         self.fake = self._fake(make, wire)
         self.fake.limits_degC = ALLOWED_DEGC
         self.line: PtyWire | TcpWire = (
@@ -76,11 +126,13 @@ class Bench:
 @asynccontextmanager
 async def bench_of(make: str, wire: str, folder: Path, **settings: object) -> AsyncGenerator[Any]:
     bench = Bench(make, wire, folder, **settings)
-    try:
-        yield bench
-    finally:
-        await bench.driver.close()
-        bench.line.close()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LineClient, "_quarantine", bench.faults.noticed(vars(LineClient)["_quarantine"]))
+        try:
+            yield bench
+        finally:
+            await bench.driver.close()
+            bench.line.close()
 
 
 @asynccontextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ async def test_a_late_reply_is_never_taken_for_the_next_one(make: str, wire: str
     async with bench_of(make, wire, tmp_path) as bench:
         await bench.driver.open()
         for value_degC in (30.0, 35.0, 40.0):
-            bench.faults.late_s = 0.33  # after the time-out, within the quarantine
+            bench.faults.hold()
             bench.fake.stuck_degC = value_degC - 1
             with pytest.raises(DeviceError) if wire == "tcp" else _nothing():
                 await bench.driver.read()
@@ -35,13 +36,14 @@ class _nothing:
 @pytest.mark.parametrize(("make", "wire"), ON_WIRES)
 async def test_among_hundreds_of_reads_with_faults_no_temperature_is_wrong(make: str, wire: str, tmp_path: Path):
     """ASCII-2 and ESPEC have no checksum: no bit flips, which nothing could find; lost, cut and late replies are."""
-    async with bench_of(make, wire, tmp_path, timeout_s=0.05) as bench:
+    async with bench_of(make, wire, tmp_path, timeout_s=0.1) as bench:
         await bench.driver.open()
-        faults = bench.faults
-        faults.drop = faults.cut = faults.late = 0.01
-        faults.late_by_s = 0.08
+        faults, seeded = bench.faults, random.Random(5)
+        faults.drop = faults.cut = 0.01
         read = 0
         for number_ in range(120):
+            if seeded.random() < 0.04:
+                faults.hold()
             bench.fake.stuck_degC = 20.0 + number_ / 10
             try:
                 found = await bench.read()
