@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePath
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # Before NumPy is loaded: as the commands and `make test` have it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -17,6 +18,10 @@ from tests import forked
 from tests.forked import STARTERS, Forks, Programs
 from tests.stock_camera import run_stock_camera
 from tests.workers import run_units
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
 _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera.py"}

@@ -15,6 +15,7 @@ from drivers.sim.physics.scene import Scene, SceneSpec, disc_coverages, polygon_
 TIME_ns = 1_700_000_000_000_000_000
 FLAT = SceneSpec(light_slope=(0.0, 0.0), vignetting=0.0)
 ROWS = 700  # with markers in them
+SCENE = Scene(FLAT, seed=1)
 COLD = Nodes(24.0, 24.0, 24.0, 24.0, 24.0, 24.0)
 
 
@@ -66,7 +67,7 @@ def _short_edges(corners: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 
 
 def test_the_noise_free_image_has_the_specified_levels():
-    image = Scene(FLAT, seed=1).noise_free(at(), 0.1, 0.0, 1.0)
+    image = SCENE.noise_free(at(), 0.1, 0.0, 1.0)
     x, y = np.round(true_centres_px(at())[22]).astype(int)
     assert image[5, 5] == pytest.approx(200.0, abs=1e-3)
     assert image[y, x] == pytest.approx(30.0, abs=1e-3)
@@ -74,9 +75,8 @@ def test_the_noise_free_image_has_the_specified_levels():
 
 
 def test_signal_follows_exposure_and_gain_but_the_black_level_does_not():
-    scene = Scene(FLAT, seed=1)
-    assert scene.noise_free(at(), 0.05, 0.0, 1.0)[0, 0] == pytest.approx(3.0 + 197.0 / 2)
-    assert scene.noise_free(at(), 0.05, 20.0 * math.log10(2.0), 1.0)[0, 0] == pytest.approx(200.0)
+    assert SCENE.noise_free(at(), 0.05, 0.0, 1.0)[0, 0] == pytest.approx(3.0 + 197.0 / 2)
+    assert SCENE.noise_free(at(), 0.05, 20.0 * math.log10(2.0), 1.0)[0, 0] == pytest.approx(200.0)
 
 
 def test_light_is_uneven_and_smooth():
@@ -128,7 +128,7 @@ def test_the_upper_rows_alone_are_those_of_the_whole_frame(rows: int, whole: NDA
 
 
 def test_an_overexposed_frame_clips_at_255():
-    frame = Scene(FLAT, seed=1).render(at(), TIME_ns, 0.2, 0.0, 1.0)
+    frame = SCENE.render(at(), TIME_ns, 0.2, 0.0, 1.0)
     assert frame[:50].min() == 255
     x, y = np.round(true_centres_px(at())[22]).astype(int)
     assert frame[y, x] < 80
@@ -142,7 +142,7 @@ def test_a_shut_flap_gives_a_dark_frame():
 
 
 def test_a_half_open_flap_shades_linearly_from_the_top():
-    rows = Scene(FLAT, seed=1).noise_free(at(), 0.1, 0.0, 0.475)[:, 0] - 3.0
+    rows = SCENE.noise_free(at(), 0.1, 0.0, 0.475)[:, 0] - 3.0
     assert rows[0] == pytest.approx(197.0)
     assert rows[-1] == pytest.approx(0.0, abs=0.2)
     assert np.diff(rows) == pytest.approx(np.diff(rows).mean(), rel=0.01)
@@ -150,7 +150,7 @@ def test_a_half_open_flap_shades_linearly_from_the_top():
 
 def test_markers_cut_by_the_border_are_drawn_as_far_as_they_reach():
     optics = at(linear_mm=-140.0)
-    image = Scene(FLAT, seed=1).noise_free(optics, 0.1, 0.0, 1.0)
+    image = SCENE.noise_free(optics, 0.1, 0.0, 1.0)
     centres = true_centres_px(optics)
     assert (centres[:, 0] < 0.0).any()
     edge = centres[(centres[:, 0] > -20.0) & (centres[:, 0] < 20.0)]
@@ -160,7 +160,7 @@ def test_markers_cut_by_the_border_are_drawn_as_far_as_they_reach():
 
 def test_a_target_out_of_sight_leaves_the_paper_white():
     optics = optics_at("modified", COLD, Placement(target_offset_mm=(2000.0, 0.0)))
-    assert Scene(FLAT, seed=1).noise_free(optics, 0.1, 0.0, 1.0).min() == pytest.approx(200.0, abs=1e-3)
+    assert SCENE.noise_free(optics, 0.1, 0.0, 1.0).min() == pytest.approx(200.0, abs=1e-3)
 
 
 def test_a_still_scene_renders_once_until_another_exposure_is_asked_for():

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import yaml
 
 from foundation.clock import VirtualClock
@@ -60,45 +61,55 @@ from foundation.documents import load_document
 from foundation.hub import Hub
 from stand.assembly import assemble
 from stand.config.stand_config import StandConfig
-try:
-    config = load_document(Path(sys.argv[2]), StandConfig)
-except ConfigError as error:
-    sys.exit(str(error))
-cameras = assemble(config, Hub(), VirtualClock(0)).devices.cameras
-print([(name, type(camera).__module__) for name, camera in cameras.items()])
-print(asyncio.run(cameras["side"].grab()).image.mean())
+for path in sys.argv[2:]:
+    try:
+        config = load_document(Path(path), StandConfig)
+    except ConfigError as error:
+        print(error)
+        continue
+    cameras = assemble(config, Hub(), VirtualClock(0)).devices.cameras
+    modules = [(name, type(camera).__module__) for name, camera in cameras.items()]
+    print(modules, asyncio.run(cameras["side"].grab()).image.mean())
 """
 
 
-def used(tmp_path: Path, side: dict[str, object]) -> "subprocess.CompletedProcess[str]":
-    (tmp_path / "devices").mkdir(exist_ok=True)
-    (tmp_path / "devices" / "camera_still.py").write_text(CAMERA_FILE)
+SIDES: dict[str, dict[str, object]] = {
+    "right": {"protocol": "still", "address": "nowhere", "shade_DN": 9, "has_temperature": False},
+    "key": {"protocol": "still", "address": "nowhere", "packet_size": 8000},
+    "protocol": {"protocol": "film", "address": "nowhere"},
+}
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What a program in which that file is beside ours makes of a stand with each camera: a line each."""
+    folder = tmp_path_factory.mktemp("stands")
+    (folder / "devices").mkdir()
+    (folder / "devices" / "camera_still.py").write_text(CAMERA_FILE)
     data = yaml.safe_load(packaged("", "simulated").read_text())
-    data["cameras"]["side"] = side
-    (tmp_path / "stand.yaml").write_text(yaml.safe_dump(data))
-    return subprocess.run(
-        [sys.executable, "-c", USED, str(tmp_path / "devices"), str(tmp_path / "stand.yaml")],
+    for name, side in SIDES.items():
+        data["cameras"]["side"] = side
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(data))
+    done = subprocess.run(
+        [sys.executable, "-c", USED, str(folder / "devices"), *(str(folder / f"{name}.yaml") for name in SIDES)],
         capture_output=True,
         text=True,
         check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
+    assert (done.returncode, done.stderr) == (0, "")
+    return dict(zip(SIDES, done.stdout.splitlines(), strict=True))
 
 
-def test_a_second_camera_protocol_is_one_file(tmp_path: Path):
-    done = used(tmp_path, {"protocol": "still", "address": "nowhere", "shade_DN": 9, "has_temperature": False})
-    assert done.stdout.splitlines() == [
-        "[('camera', 'drivers.devices.cameras.camera_gige'), ('side', 'drivers.devices.cameras.camera_still')]",
-        "9.0",
-    ], done.stderr
+def test_a_second_camera_protocol_is_one_file(said: dict[str, str]):
+    assert said["right"] == (
+        "[('camera', 'drivers.devices.cameras.camera_gige'), ('side', 'drivers.devices.cameras.camera_still')] 9.0"
+    )
 
 
-def test_the_keys_of_a_second_camera_protocol_are_checked(tmp_path: Path):
-    done = used(tmp_path, {"protocol": "still", "address": "nowhere", "packet_size": 8000})
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert "packet_size: unknown key" in done.stderr
-    other = used(tmp_path, {"protocol": "film", "address": "nowhere"})
-    assert other.stderr.endswith("stand.yaml: cameras.side: protocol has to be one of gige, still, usb3 (line 32)\n")
+def test_the_keys_of_a_second_camera_protocol_are_checked(said: dict[str, str]):
+    assert "packet_size: unknown key" in said["key"]
+    assert said["protocol"].endswith(".yaml: cameras.side: protocol has to be one of gige, still, usb3 (line 32)")
 
 
 def test_a_second_regulator_make_is_a_yaml(tmp_path: Path):

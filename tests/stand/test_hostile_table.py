@@ -46,7 +46,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def ask():
-    with commands() as asking:
+    with commands("stand.commands.sessions.session_cli") as asking:
+        yield asking
+
+
+@pytest.fixture(scope="module")
+def ask_all():
+    with commands("stand.commands.sessions.session_cli", "compensation.commands.fit_cli") as asking:
         yield asking
 
 
@@ -93,11 +99,11 @@ def test_a_hostile_session_has_its_word_soon(row: str, whole: Path, tmp_path: Pa
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("row", ROWS)
-def test_every_command_answers_on_a_hostile_session(row: str, whole: Path, tmp_path: Path, ask):
+def test_every_command_answers_on_a_hostile_session(row: str, whole: Path, tmp_path: Path, ask_all):
     session = made(whole, tmp_path, row)
     for name, command in (LOOKS | USES | CHANGES).items():
         out = tmp_path / f"made-by-{name}"
-        answer = ask(*words(command, session, out))
+        answer = ask_all(*words(command, session, out))
         check(name, answer)
         if name == "verify":
             check_verified(answer, ROWS[row].files)
@@ -107,7 +113,7 @@ def test_every_command_answers_on_a_hostile_session(row: str, whole: Path, tmp_p
         if name in USES and row in WITH_HOLES:
             assert answer.status in (1, 2), (name, answer)
             assert "--incomplete" in answer.said, (name, answer)
-    again = ask(*words(CHANGES["salvage"], session, tmp_path / "out"))
+    again = ask_all(*words(CHANGES["salvage"], session, tmp_path / "out"))
     check("salvage, once more", again)
     assert again.status in (0, 2), again  # what a first salvage could not recover a second one does not find
-    check("verify, once more", ask(*words(LOOKS["verify"], session, tmp_path / "out")))
+    check("verify, once more", ask_all(*words(LOOKS["verify"], session, tmp_path / "out")))

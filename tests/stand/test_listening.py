@@ -19,7 +19,7 @@ from tests.asking import ask
 from tests.stand.a_desk import ADesk, served
 
 STATE = b"GET /api/v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
-LOOKS, PERIOD_S = 60, 0.02
+LOOKS, PERIOD_S = 40, 0.02
 
 
 def connected(session: Path) -> socket.socket:
@@ -78,20 +78,36 @@ async def lateness_s() -> list[float]:
     return sorted(late_s)
 
 
+ANOTHER = """
+import sys, time
+
+late_s, due_s = [], time.monotonic()
+for _ in range(int(sys.argv[1])):
+    due_s = max(due_s + float(sys.argv[2]), time.monotonic())
+    time.sleep(max(0.0, due_s - time.monotonic()))
+    late_s.append(time.monotonic() - due_s)
+print(sorted(late_s)[len(late_s) // 2])
+"""
+
+
 async def test_a_flood_of_clients_makes_neither_the_control_loop_late_nor_shuts_out_a_stop(tmp_path: Path):
     """The daemon's thread has a budget of processor time; that of the whole process is compared with it, so that a busy
-    machine changes nothing. What the control loop is late is the median: others have this machine, too."""
+    machine changes nothing. What the control loop is late is the median, and compared with that of a process which has
+    nothing to do with it: it takes turns with one thread more, each of which may wait for a processor."""
     async with served(ADesk(), tmp_path) as desk:
         await asyncio.to_thread(ask, tmp_path, "stop")  # everything is imported
         with flood(tmp_path, 2 * MOST_CLIENTS):
             await asyncio.sleep(1.0)
+            command = [sys.executable, "-S", "-c", ANOTHER, str(LOOKS), str(PERIOD_S)]
+            another = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
             began_s, used_s = time.monotonic(), time.process_time()
             late_s = await lateness_s()
             for _ in range(3):
                 assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
                 assert (await asyncio.to_thread(server_of(tmp_path).state)).stand == "a stand"
+            another_s = float((await asyncio.to_thread(another.communicate))[0])
             share = (time.process_time() - used_s) / (time.monotonic() - began_s)
-    assert late_s[len(late_s) // 2] < 0.01
+    assert late_s[len(late_s) // 2] < 0.01 + 4 * another_s
     assert share < 0.8
     assert {verb for _, verb, _ in desk.orders} == {"stop"}
 
