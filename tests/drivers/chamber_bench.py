@@ -92,7 +92,7 @@ class Bench:
             if wire == "serial"
             else TcpWire("127.0.0.1", 0, self.fake.engine, self.faults)
         )
-        known: dict[str, object] = {"protocol": make, "address": self.line.address, "timeout_s": 0.3, "gap_s": 0.0}
+        known: dict[str, object] = {"protocol": make, "address": self.line.address, "timeout_s": 1.0, "gap_s": 0.0}
         if make not in ("espec", "simserv"):
             known["limits_at_panel_degC"] = list(ALLOWED_DEGC)
         if make in ("cts", "julabo"):
