@@ -327,6 +327,7 @@ class Laboratory:
                 address,
                 settings.serial_number or "",
                 real_time=not self.spec.virtual,
+                warms_up=not self.spec.virtual and self._flap is None,  # a shut flap's warms nothing
                 pace_MBps=_PACE_MBps[self.spec.virtual] if len(self.spec.cameras) < 2 else _LINE_MBps,
                 boot_s=self.spec.camera_boot_s,
                 genicam=genicam,

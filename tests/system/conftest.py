@@ -21,7 +21,7 @@ from tests.sections import change
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.
-CORNER: dict[str, object] = {"width_px": 612, "height_px": 256}
+CORNER: dict[str, object] = {"width_px": 612, "height_px": 64}
 AS_INSTALLED: dict[str, dict[str, object]] = {
     "regulator": {"poll_s": 5.0},
     "thermometer_module": {"poll_s": 5.0},

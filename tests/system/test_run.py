@@ -25,7 +25,7 @@ from stand.running.order import Order
 from stand.running.run import Interrupted, run_virtual
 from stand.simulator import ControlSocket
 from tests import forked
-from tests.system.conftest import AS_INSTALLED, SHORT_RECIPE, WHOLE_SENSOR, require_aravis
+from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE, WHOLE_SENSOR, require_aravis
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 
@@ -79,7 +79,7 @@ async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_p
     captures = {step.step_id: step for step in session.steps() if step.kind == "Capture"}
     frames = list(session.frames())
     assert all(frame.step_id in captures for frame in frames)
-    assert frames[0].image.shape == (256, 612)
+    assert frames[0].image.shape == (CORNER["height_px"], CORNER["width_px"])
     assert frames[0].image.max() > 150  # the flap was open
     assert [event.kind for event in session.events() if event.kind.startswith("run.")] == ["run.start", "run.end"]
     check_temperatures(session)

@@ -80,6 +80,7 @@ class FakeCamera:
     the start of the exposure. `boot_s` is simulated time from power-on to the first answer; a camera that has power
     when it is built is ready. `faults` and `counts` are open to all. With `genicam` it shows that file's features
     instead of ours, and is a camera of that make to its client. `thermometers`: of its own, else the plant's.
+    With `warms_up` it renders an image before it is asked for any: the first one is slow.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class FakeCamera:
         *,
         size_px: tuple[int, int] = (WIDTH_px, HEIGHT_px),
         real_time: bool = False,
+        warms_up: bool = False,
         pace_MBps: float = 40.0,
         boot_s: float = 3.0,
         extended_ids: bool = False,
@@ -105,6 +107,7 @@ class FakeCamera:
         self._clock = clock
         self._render = render
         self._real_time = real_time
+        self._warms_up = warms_up
         self._boot_ns = seconds_ns(boot_s)
         self._extended_ids = extended_ids
         self.faults = faults or CameraFaults()
@@ -188,7 +191,8 @@ class FakeCamera:
         """The clock has moved to now_ns: note a change of power, wake the free run. Returns at once."""
         with self._wake:
             self._observe_power(now_ns)
-            self._wake.notify_all()
+            if self._schedule.is_free_running:  # else no time, which moves often, makes anything due
+                self._wake.notify_all()
 
     # ------------------------------------------------------------------------------------------------------- power
 
@@ -314,7 +318,7 @@ class FakeCamera:
     # ------------------------------------------------------------------------------------------------------ images
 
     def _expose(self) -> None:
-        if self._real_time:  # the first image is slow: not within an acquisition
+        if self._warms_up:
             self._render(self._clock.now_ns(), 0.001, 0.0, self._registers.integer("HeightMax"))
         while (shot := self._next_shot()) is not None:
             rows = self._registers.integer("OffsetY") + self._registers.integer("Height")

@@ -74,6 +74,11 @@ class Schedule:
         """The acquisition that the exposure belongs to has not been stopped."""
         return shot.acquisition == self._acquisition
 
+    @property
+    def is_free_running(self) -> bool:
+        """It exposes as time goes on, without being triggered."""
+        return self.streaming and not self._triggering()
+
     def due(self, now_ns: int) -> tuple[Shot | None, int]:
         """The exposure to read out now, if any, and when to look again (ns)."""
         shot, again_ns = self._due(now_ns)

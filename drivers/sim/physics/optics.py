@@ -202,7 +202,8 @@ def project(optics: Optics, target_mm: NDArray[np.float64]) -> NDArray[np.float6
     plane = np.concatenate((target_mm * (1.0, -1.0), np.ones((*target_mm.shape[:-1], 1))), axis=-1)
     ray = plane @ _target_to_camera(optics).T
     normal = ray[..., :2] / ray[..., 2:]
-    distorted = normal * (1.0 + optics.k1 * np.sum(normal**2, axis=-1, keepdims=True))
+    radius_squared = normal[..., :1] ** 2 + normal[..., 1:] ** 2
+    distorted = normal * (1.0 + optics.k1 * radius_squared)
     on_sensor = np.concatenate((distorted, np.ones_like(ray[..., 2:])), axis=-1) @ _ray_to_sensor(optics).T
     return on_sensor[..., :2] / on_sensor[..., 2:] + (optics.cx_px, optics.cy_px)
 

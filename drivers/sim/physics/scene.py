@@ -127,11 +127,15 @@ def disc_coverages(optics: Optics, blur_px: float, rows: int = HEIGHT_px) -> lis
 
     Arrays are not cut at the image's border; the sum of a coverage is the disc's area in px^2.
     """
-    widest_px = np.ptp(outlines_px(optics, 16), axis=1).max()
-    outlines = outlines_px(optics, math.ceil(math.pi * widest_px * 1.1 * SUBCELLS / EDGE_CELLS))
     margin_px = math.ceil(BLUR_REACH * blur_px) + 1
-    corners = np.floor(outlines.min(axis=1)).astype(int) - margin_px
-    width, height = (np.ceil(outlines.max(axis=1)).astype(int) + margin_px + 1 - corners).max(axis=0)
+    least, most = _boxes(outlines_px(optics, 16))
+    widest_px = (most - least).max()
+    if least[:, 1].min() - 0.1 * widest_px - margin_px > rows:  # these outlines are 2 % of a radius too small at most
+        return []
+    outlines = outlines_px(optics, math.ceil(math.pi * widest_px * 1.1 * SUBCELLS / EDGE_CELLS))
+    least, most = _boxes(outlines)
+    corners = np.floor(least).astype(int) - margin_px
+    width, height = (np.ceil(most).astype(int) + margin_px + 1 - corners).max(axis=0)
     across, down = _blur_matrix(int(width), blur_px), _blur_matrix(int(height), blur_px)
     discs: list[tuple[int, int, NDArray[np.float32]]] = []
     for outline, (left, top) in zip(outlines, corners, strict=True):
@@ -143,6 +147,12 @@ def disc_coverages(optics: Optics, blur_px: float, rows: int = HEIGHT_px) -> lis
         np.matmul(down @ fine, across.T, out=coverage)
         discs.append((int(left), int(top), coverage))
     return discs
+
+
+def _boxes(outlines: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of outlines (n, points, 2) the smallest and the largest x and y, (n, 2) each."""
+    x, y = np.ascontiguousarray(outlines[..., 0]), np.ascontiguousarray(outlines[..., 1])  # ten times as fast as pairs
+    return np.stack((x.min(axis=1), y.min(axis=1)), axis=-1), np.stack((x.max(axis=1), y.max(axis=1)), axis=-1)
 
 
 def polygon_coverage(vertices: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
@@ -166,7 +176,9 @@ def polygon_coverage(vertices: NDArray[np.float64], width: int, height: int) -> 
     index = (row * (width + 1) + column).astype(np.intp).ravel()
     area = np.bincount(index, (rise - to_next).ravel(), height * (width + 1))
     area[1:] += np.bincount(index, to_next.ravel(), height * (width + 1))[:-1]
-    return np.abs(np.cumsum(area.reshape(height, width + 1), axis=1)[:, :-1])
+    inside = area.reshape(height, width + 1)
+    np.add.accumulate(inside, axis=1, out=inside)
+    return np.abs(inside[:, :-1], out=inside[:, :-1])
 
 
 @functools.lru_cache(maxsize=8)
