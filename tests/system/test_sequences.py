@@ -30,10 +30,10 @@ experiments:
       frames_per_position: 1
       settle_s: 90
   - validation:
-      temperatures_degC: [24, 30]
+      temperatures_degC: [24, 27]
       positions: [{linear_mm: 20, rotary_deg: 0}, {linear_mm: 25, rotary_deg: 4}]
       equilibrium_s: 120
-      dwell_s: 300
+      dwell_s: 120
       reference_frames: 2
       frames_per_position: 1
       check_home_every: 1

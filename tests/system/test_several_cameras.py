@@ -20,8 +20,9 @@ from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import resume, run_virtual
 from tests.dialects import DIALECTS
+from tests.sections import change
 
-from .conftest import require_aravis
+from .conftest import CALM, require_aravis
 from .test_run import at_step
 
 CAPTURES = """
@@ -48,7 +49,9 @@ def recorded(data: dict[str, dict[str, object]], recipe: str, out: Path) -> Path
 
 
 def simulated() -> dict[str, dict[str, object]]:
-    return yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    change(data, CALM)
+    return data
 
 
 @pytest.mark.usefixtures("compiled_fit")

@@ -5,14 +5,16 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from recording.reading.session import Session
 from stand.config.stand_config import packaged
 from tests import forked
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.sections import change
+from tests.system.conftest import CALM, CORNER, SHORT_RECIPE, require_aravis
 from tests.system.test_run import digests
 
-# The whole sensor, in a night as short as it can be.
+# A night as short as it can be.
 RECIPE = (
     SHORT_RECIPE.replace("600", "60")
     .replace("[30, 20, 24]", "[26]")
@@ -54,15 +56,20 @@ def test_two_virtual_nights_side_by_side_of_the_installed_configuration_give_the
 
 def test_a_virtual_run_goes_on_and_a_new_one_begins_while_the_laboratory_of_a_killed_one_lives(tmp_path: Path):
     """An orphaned laboratory lives for a minute; nobody waits for its addresses."""
-    recipe = tmp_path / "short.yaml"
+    recipe, config = tmp_path / "short.yaml", tmp_path / "config.yaml"
     recipe.write_text(RECIPE)
-    killed = begun(tmp_path, "killed", "run", str(recipe))
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    change(data, CALM)
+    data["cameras"]["camera"] |= CORNER
+    config.write_text(yaml.safe_dump(data))
+    arguments = ("run", str(recipe), "--config", str(config))
+    killed = begun(tmp_path, "killed", *arguments)
     assert killed.stderr is not None
     assert any(line.startswith("run:") for line in killed.stderr)  # it is under way
     killed.kill()
     killed.communicate()
     (session,) = (tmp_path / "killed").iterdir()
     resumed = forked.popen([*STAND, "resume", str(session)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    new = begun(tmp_path, "new", "run", str(recipe))
+    new = begun(tmp_path, "new", *arguments)
     assert ended(resumed) == session
     assert Session.open(session).frame_count == Session.open(ended(new)).frame_count == 2
