@@ -33,6 +33,7 @@ _LONG_FILES = {f"tests/stand/test_page{part}.py" for part in ("", "_orders", "_r
 _TOGETHER = {
     # Real devices belong to one program by their serial numbers, whatever their addresses.
     "tests/system/test_queue_wires.py",
+    "tests/system/test_camera_lost.py",
     "tests/system/test_camera_wire.py",
     "tests/system/test_failure_table.py",
     "tests/system/test_kill_recording.py",

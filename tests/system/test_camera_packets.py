@@ -13,7 +13,7 @@ from drivers.wires import camera_connection
 from foundation.clock import NS_PER_S, VirtualClock, WallClock
 from foundation.errors import Unreachable
 from foundation.readings import Frame
-from tests.system.test_camera_wire import WarmPlant, noise, opened, simulated, virtual
+from tests.system.camera_bench import WarmPlant, noise, opened, simulated, virtual
 
 FRAMES = 5
 

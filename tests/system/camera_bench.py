@@ -1,0 +1,96 @@
+"""A camera driver, through Aravis, and our own GigE Vision camera before it on a loopback address."""
+
+import asyncio
+import threading
+from collections.abc import AsyncGenerator, Generator
+from contextlib import asynccontextmanager, contextmanager
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.devices.cameras.camera_gige import Camera
+from drivers.sim.gige.camera import FakeCamera
+from drivers.wires.camera_settings import GigeCameraSettings
+from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock
+from tests.addresses import usual_camera_address
+
+SERIAL = "C0061"
+WIDTH_px, HEIGHT_px = 640, 480
+START_NS = 1_700_000_000 * NS_PER_S
+EXPOSURE_S = 0.05
+
+
+class WarmPlant:
+    """As much of a plant as a camera sees."""
+
+    def __init__(self, now_ns: int) -> None:
+        self.sensor_degC = 41.5
+        self.body_degC = 38.0
+        self.camera_power_on_ns: int | None = now_ns
+        self.camera_powered = True
+        self.lock = threading.RLock()
+
+    def advance(self, now_ns: int) -> None:
+        """Nothing changes here."""
+
+    def switch_camera(self, now_ns: int, *, on: bool) -> None:
+        with self.lock:
+            self.camera_powered = on
+            if on:
+                self.camera_power_on_ns = now_ns
+
+
+def noise(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT_px) -> NDArray[np.uint8]:
+    """An image that belongs to one instant only."""
+    return np.random.default_rng(time_ns).integers(0, 256, (HEIGHT_px, WIDTH_px), dtype=np.uint8)[:rows]
+
+
+@contextmanager
+def simulated(clock: WallClock | FollowedClock, plant: WarmPlant, serial: str = SERIAL) -> Generator[FakeCamera]:
+    real_time = isinstance(clock, WallClock)
+    fake = FakeCamera(
+        plant,
+        clock,
+        noise,
+        usual_camera_address(),
+        serial,
+        size_px=(WIDTH_px, HEIGHT_px),
+        real_time=real_time,
+        boot_s=0.2,
+    )
+    fake.start()
+    try:
+        yield fake
+    finally:
+        fake.close()
+
+
+def settings(**changes: object) -> GigeCameraSettings:
+    usual: dict[str, object] = {"serial_number": SERIAL, "exposure_s": EXPOSURE_S, "heartbeat_s": 1.5}
+    return GigeCameraSettings.model_validate({"address": usual_camera_address(), **usual, **changes})
+
+
+@asynccontextmanager
+async def opened(clock: WallClock | VirtualClock | None = None, **changes: object) -> AsyncGenerator[Camera]:
+    camera = Camera("camera", settings(**changes), clock or WallClock())
+    try:
+        await camera.open()
+        yield camera
+    finally:
+        await camera.close()
+
+
+@asynccontextmanager
+async def virtual(plant: WarmPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
+    """A simulated camera that follows a virtual clock."""
+    followed = FollowedClock(START_NS)
+    with simulated(followed, plant) as fake:
+
+        async def advance(time_ns: int) -> None:
+            followed.follow(time_ns)
+            fake.advance(time_ns)
+
+        clock = VirtualClock(START_NS, advance)
+        running = asyncio.create_task(clock.run())
+        yield clock, fake
+        running.cancel()
