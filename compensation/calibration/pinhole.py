@@ -18,7 +18,7 @@ from compensation.calibration.least_squares import Float
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """The order of a camera's vector: that of OpenCV and mrcal."""
 
-_UNDISTORTIONS = 30
+_UNDISTORTIONS, _UNDISTORTED = 30, 1e-14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +58,8 @@ class Pinhole:
         slopes = wanted.copy()
         for _ in range(_UNDISTORTIONS):
             off = wanted - _distorted(slopes, self.distortion)
+            if np.abs(off).max(initial=0.0) < _UNDISTORTED:
+                break
             slopes = slopes + np.linalg.solve(_bend(slopes, self.distortion), off[..., None])[..., 0]
         off = np.abs(wanted - _distorted(slopes, self.distortion)).max(axis=-1)
         above, below, _ = _radial(np.sum(slopes**2, axis=-1), self.distortion)
@@ -97,34 +99,28 @@ def _radial(square: Float, distortion: Float) -> tuple[Float, Float, Float]:
 
 
 def _distorted(slopes: Float, distortion: Float) -> Float:
-    x, y = np.moveaxis(slopes, -1, 0)
+    x, y = slopes[..., 0], slopes[..., 1]
     p1, p2 = distortion[2:4]
     square = x**2 + y**2
     above, below, _ = _radial(square, distortion)
     gain = above / below
-    return np.stack(
-        [
-            x * gain + 2 * p1 * x * y + p2 * (square + 2 * x**2),
-            y * gain + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    distorted = np.empty_like(slopes)
+    distorted[..., 0] = x * gain + 2 * p1 * x * y + p2 * (square + 2 * x**2)
+    distorted[..., 1] = y * gain + p1 * (square + 2 * y**2) + 2 * p2 * x * y
+    return distorted
 
 
 def _bend(slopes: Float, distortion: Float) -> Float:
     """Derivative (..., 2, 2) of the distorted with respect to the ideal slopes."""
-    x, y = np.moveaxis(slopes, -1, 0)
+    x, y = slopes[..., 0], slopes[..., 1]
     p1, p2 = distortion[2:4]
     above, below, gain_slope = _radial(x**2 + y**2, distortion)
     gain = above / below
-    mixed = 2 * x * y * gain_slope + 2 * p1 * x + 2 * p2 * y
-    return np.stack(
-        [
-            np.stack([gain + 2 * x**2 * gain_slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1),
-            np.stack([mixed, gain + 2 * y**2 * gain_slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
-        ],
-        axis=-2,
-    )
+    bend = np.empty((*slopes.shape, 2))
+    bend[..., 0, 0] = gain + 2 * x**2 * gain_slope + 2 * p1 * y + 6 * p2 * x
+    bend[..., 0, 1] = bend[..., 1, 0] = 2 * x * y * gain_slope + 2 * p1 * x + 2 * p2 * y
+    bend[..., 1, 1] = gain + 2 * y**2 * gain_slope + 6 * p1 * y + 2 * p2 * x
+    return bend
 
 
 def _lens_jacobian(slopes: Float, distortion: Float) -> Float:

@@ -9,11 +9,11 @@ from compensation.calibration.least_squares import Float
 
 def crosses(vectors: Float) -> Float:
     """Matrices (..., 3, 3) that multiply by `vectors` x from the left."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack(
-        [np.stack([zero, -z, y], axis=-1), np.stack([z, zero, -x], axis=-1), np.stack([-y, x, zero], axis=-1)], axis=-2
-    )
+    matrices = np.zeros((*vectors.shape, 3))
+    for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
+        matrices[..., row, column] = vectors[..., axis]
+        matrices[..., column, row] = -vectors[..., axis]
+    return matrices
 
 
 def across(axis: Float) -> Float:

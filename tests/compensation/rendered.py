@@ -190,12 +190,15 @@ def _draw(scene: Scene, image: Float, disc: Float, contrast_DN: float) -> None:
     margin = int(np.ceil(6 * scene.psf_px)) + 2
     low = np.floor(outline.min(axis=0)).astype(int) - margin
     high = np.ceil(outline.max(axis=0)).astype(int) + margin + 1
-    u, v = (low[i] - 0.5 + (np.arange((high[i] - low[i]) * SUB) + 0.5) / SUB for i in (0, 1))
+    # Nearly all of the margin is blur: the disc itself, and what it takes, ends a pixel beyond its outline.
+    beyond = margin - 1
+    own = [slice(beyond * SUB, (high[i] - low[i] - beyond) * SUB) for i in (0, 1)]
+    u, v = (low[i] - 0.5 + (np.arange(own[i].start, own[i].stop) + 0.5) / SUB for i in (0, 1))
     u, v = u[None, :], v[:, None]
     x, y = back_project(scene, u, v)
     cover = _coverage(np.hypot(x - disc[0], y - disc[1]) - disc[2] / 2)
     radiance = scene.light(u, v) * contrast_DN * cover
-    columns, rows = (_blur(int(high[i] - low[i]), scene.psf_px) for i in (0, 1))
+    columns, rows = (_blur(int(high[i] - low[i]), scene.psf_px)[:, own[i]] for i in (0, 1))
     pixels = rows @ radiance @ columns.T
     top, left = max(low[1], 0), max(low[0], 0)
     bottom, right = min(high[1], image.shape[0]), min(high[0], image.shape[1])
