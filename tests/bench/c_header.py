@@ -11,7 +11,7 @@ from compensation.drift.paper_model import PaperModel
 from compensation.drift.thermal_model import ThermalModel
 from tests.bench.figures import Figure, absolute, at_most, progress, side_by_side, skipped
 from tests.compensation.compiled_header import COMPILER
-from tests.compensation.test_apply import paper, thermal
+from tests.compensation.made_up_models import paper, thermal
 
 SIZE = (2448, 2048)
 _PROGRAM = Path(__file__).with_name("c_header.c")

@@ -1,11 +1,7 @@
-"""A drift model put to use: tables, images, and a module for other people's programs, all as the model itself says."""
+"""A drift model put to use by the command: tables, images and exports, all as the model itself says."""
 
-import ast
 import csv
 import itertools
-import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,160 +10,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.apply.runtime_export import export, runtime_model
 from compensation.cli import app
-from compensation.drift.drift_model import DriftModel, Outside
-from compensation.drift.facts import ModelFacts
 from compensation.drift.model_file import load_model, save_model
-from compensation.drift.paper_model import DegreeScore, PaperModel
-from compensation.drift.polynomial import exponents
-from compensation.drift.terms import Kind, Term
-from compensation.drift.thermal_model import ThermalModel, ThermalRange
 from compensation.drift.training import frame_states
-from compensation.drift_runtime import Drift
-from compensation.history.states import States, row_of, state_of
 from compensation.history.thermal_history import recorded_history, states_at
 from compensation.observations import observe, session_target
 from experiments.steps import Role
-from foundation.errors import SessionError
 from markers.detection import detect
 from recording.reading.session import Session
 
 from .conftest import Recorded
-
-SIZE = (640, 480)
-HULL = np.array([[50.0, 40.0], [600.0, 40.0], [600.0, 440.0], [50.0, 440.0]])
-FACTS = {
-    "image_size": SIZE,
-    "hull_px": HULL,
-    "reference_degC": 44.0,
-    "reference_chamber_degC": 24.0,
-    "reference_centres_px": np.array([[100.0, 90.0], [np.nan, np.nan]]),
-    "target_name": "small",
-    "camera_serial": "TS-0001",
-    "session_ids": ("night",),
-    "software_version": "0",
-}
-
-
-def paper(degree: int = 3) -> PaperModel:
-    rng, count = np.random.default_rng(degree), len(exponents(degree))
-    score = DegreeScore(
-        degree=degree, terms=count, condition=9.0, rms_px=(0.1, 0.1), fold_chamber_degC=(), fold_rms_px=()
-    )
-    return PaperModel(
-        facts=ModelFacts(camera_range_degC=(30.0, 72.0), **FACTS),
-        degree=degree,
-        coefficients=rng.normal(0, 0.2, (2, count)),
-        coefficient_covariance=np.array([1e-6 * np.eye(count)] * 2),
-        discrepancy_px=np.array([0.02, 0.03]),
-        scores=(score,),
-        candidates=(),
-    )
-
-
-def thermal(*, warmed: bool = True) -> ThermalModel:
-    """With a term of every kind."""
-    terms = (
-        *(Term(kind) for kind in (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE)),
-        *(Term(Kind.AMBIENT_LAG, tau_s) for tau_s in (600.0, 3600.0)),
-        *(Term(kind, 3600.0) for kind in (Kind.AMBIENT_LAG_SQUARE, Kind.AMBIENT_LAG_CUBE)),
-        *(Term(kind, 600.0) for kind in (Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE)),
-        Term(Kind.PLAY, 6.0),
-        Term(Kind.PLAY, 3.0),
-        Term(Kind.PART_PLAY, 2.0, 3600.0, 0.3),
-        Term(Kind.PART_PLAY, 1.0, 600.0, 0.1),
-    )
-    rng = np.random.default_rng(7)
-    return ThermalModel(
-        facts=ModelFacts(camera_range_degC=(25.0, 72.0), **FACTS),
-        terms=terms,
-        reference_ambient_degC=24.0,
-        self_heating_K=17.0,
-        reference_features=rng.normal(0, 0.1, len(terms)),
-        coefficients=rng.normal(0, 0.2, (8, len(terms))),
-        coefficient_covariance=np.array([1e-6 * np.eye(len(terms))] * 8),
-        leverage_matrix=2e-6 * np.eye(len(terms)),
-        discrepancy_px=np.array([0.003, 0.004]),
-        valid=ThermalRange((10.0, 52.0), (-9.0, 9.0), 120.0 if warmed else np.inf),
-        has_warm_up=True,
-        candidates=(),
-    )
-
-
-MODELS = [pytest.param(paper(1), id="P1"), pytest.param(paper(4), id="P4"), pytest.param(thermal(), id="thermal"),
-          pytest.param(thermal(warmed=False), id="never switched on")]  # fmt: skip
-POINTS = np.random.default_rng(3).uniform((0, 0), SIZE, (40, 2))
-# dt_s, air, power, camera: a cold start, a ramp, a minute without power, a silent camera, a gap, a warm start; a gap,
-# and a camera that is switched on cold.
-LIFE = [
-    *((10.0, 15.0, 1.0, 15.0 + 17 * (1 - np.exp(-k / 60))) for k in range(200)),
-    *((10.0, 15.0 + 0.1 * k, 1.0, 32.0 + 0.09 * k) for k in range(300)),
-    *((10.0, 45.0, 0.0, np.nan) for _ in range(6)),
-    (7.0, 45.0, 0.5, 50.0),
-    *((10.0, 40.0, 1.0, 55.0) for _ in range(30)),
-    (5.0, np.nan, 1.0, 50.0),
-    *((10.0, 24.0, 1.0, 44.0) for _ in range(1200)),
-    (5.0, np.nan, 1.0, 44.0),
-    *((10.0, 24.0, 0.0, np.nan) for _ in range(30)),
-    *((10.0, 24.0, 1.0, 24.0 + 17 * (1 - np.exp(-k / 60))) for k in range(200)),
-]
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(model: DriftModel, tmp_path: Path):
-    export(model, tmp_path / "new")
-    live, state = Drift.load(tmp_path / "new" / "drift.json"), state_of(model.memory)
-    assert np.isnan(live.correct(POINTS)).all()
-    seen = set()
-    for number, sample in enumerate(LIFE):
-        live.advance(*sample)
-        state.advance(*sample)
-        if number % 7 and not np.isnan(sample).any():
-            continue
-        states = (
-            States.from_rows(model.memory, row_of(state)[None])
-            if model.form == "thermal"
-            else States.at_degC(live._camera_degC, 1)
-        )
-        np.testing.assert_allclose(live.correct(POINTS), model.correct(POINTS, states), atol=1e-12)
-        np.testing.assert_array_equal(live.flags(POINTS), model.flags(POINTS, states))
-        seen |= set(live.flags(POINTS).tolist())
-    flags = Outside(0)
-    for found in seen:
-        flags |= Outside(found)
-    assert 0 in seen or (model.form == "thermal" and np.isinf(model.valid.least_on_s))
-    assert flags == (~Outside(0) if model.form == "thermal" else Outside.PLACE | Outside.CAMERA)
-
-
-def test_the_module_needs_numpy_only_and_runs_where_nothing_else_is(tmp_path: Path):
-    _, module = export(thermal(), tmp_path)
-    tree = ast.parse(module.read_text())
-    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
-    assert imported == {"json", "math", "numpy"}
-    assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
-    program = (
-        "import sys; sys.path[:0] = ['.']; from drift_runtime import Drift; d = Drift.load('drift.json');"
-        "[d.advance(10, 24.0, 1, 44.0) for _ in range(2000)]; print(d.correct([[320.5, 200.25]]).tolist());"
-        "assert not {'compensation', 'stand', 'scipy', 'cv2'} & set(sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-I", "-c", program], cwd=tmp_path, capture_output=True, check=True)
-    state = state_of(thermal().memory)
-    for _ in range(2000):
-        state.advance(10, 24.0, 1, 44.0)
-    states = States.from_rows(thermal().memory, row_of(state)[None])
-    expected = thermal().correct(np.array([[320.5, 200.25]]), states)
-    np.testing.assert_allclose(json.loads(done.stdout), expected, atol=1e-9)
-
-
-def test_the_exported_file_is_small():
-    assert len(json.dumps(runtime_model(thermal()))) < 5000
-    assert len(json.dumps(runtime_model(paper(4)))) < 5000
-
-
-def test_a_file_that_is_no_runtime_model_is_refused():
-    with pytest.raises(ValueError, match="not a drift runtime model"):
-        Drift({"format": "thermostand drift model"})
+from .made_up_models import paper, thermal
 
 
 def run(*arguments: object, status: int = 0) -> str:
@@ -376,26 +229,6 @@ def test_a_session_is_corrected_with_the_form_in_use_and_so_is_an_export(
     assert (tmp_path / "both.csv").read_bytes() == (tmp_path / "thermal.csv").read_bytes()
     assert (tmp_path / "both" / "drift.json").read_bytes() == (tmp_path / "thermal" / "drift.json").read_bytes()
     assert files["thermal"].exists()
-
-
-def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_path: Path):
-    path = tmp_path / "model.json"
-    for model, other in ((thermal(), paper(2)), (paper(2), thermal())):
-        save_model(replace(model, other=other), path)
-        loaded = load_model(path)
-        assert (loaded.form, loaded.other and loaded.other.form) == (model.form, other.form)
-        states = States.at_degC(40.0, len(POINTS))
-        for one, two in ((loaded, model), (loaded.other, other)):
-            assert one is not None
-            np.testing.assert_array_equal(one.shift(POINTS, states.camera_degC), two.shift(POINTS, states.camera_degC))
-    data = json.loads(path.read_text())
-    old = {name: value for name, value in data.items() if name != "other"} | {"schema_version": 2}
-    path.write_text(json.dumps(old))
-    assert load_model(path).other is None
-    for changed in ({"camera_serial": "TS-0002"}, {"other": old}):
-        path.write_text(json.dumps(data | {"other": data["other"] | changed}))
-        with pytest.raises(SessionError, match=r"model\.json: not a drift model of this program \(other"):
-            load_model(path)
 
 
 def test_export_says_what_it_has_written(files: dict[str, Path], tmp_path: Path):

@@ -7,7 +7,7 @@ import pytest
 
 from compensation.design.courses import Known, best_course
 from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
-from compensation.design.next_visit import Wanted, decide
+from compensation.design.next_visit import Decision, Wanted, decide
 from compensation.design.wanted_states import wanted_states
 from compensation.drift.training import frame_states
 from compensation.history.states import Float, Memory
@@ -99,13 +99,19 @@ def test_states_at_rest_are_nearer_to_the_chamber_than_those_on_the_way(observed
     assert len(both.air_degC) == len(both.states.camera_degC) == 42
 
 
-def test_decisions_are_the_same_for_the_same_frames_and_stay_within_what_is_wanted(observed: Observations):
-    decisions = [decide(observed, WANTED) for _ in range(2)]
-    assert decisions[0] == decisions[1]
-    assert decisions[0].kind == "visit"
-    assert 10.0 <= decisions[0].chamber_degC <= 52.0
-    assert min(abs(decisions[0].chamber_degC - degC) for degC in WANTED.held_out_degC) >= 1.0
-    assert decisions[0].dwell_s in WANTED.dwells_s
+@pytest.fixture(scope="module")
+def decided(observed: Observations) -> Decision:
+    return decide(observed, WANTED)
+
+
+def test_decisions_are_the_same_for_the_same_frames_and_stay_within_what_is_wanted(
+    observed: Observations, decided: Decision
+):
+    assert decide(observed, WANTED) == decided
+    assert decided.kind == "visit"
+    assert 10.0 <= decided.chamber_degC <= 52.0
+    assert min(abs(decided.chamber_degC - degC) for degC in WANTED.held_out_degC) >= 1.0
+    assert decided.dwell_s in WANTED.dwells_s
 
 
 def test_before_there_is_a_model_what_is_furthest_is_visited(observed: Observations):
@@ -124,7 +130,6 @@ def test_what_is_left_between_set_points_is_looked_at_before_the_night_goes_on(o
     assert decision.chamber_degC == 38.0
 
 
-def test_enough_is_known_when_the_predicted_residual_is_the_wanted_one(observed: Observations):
-    predicted_px = decide(observed, WANTED).predicted_px
-    assert decide(observed, replace(WANTED, residual_px=1.01 * predicted_px)).kind == "enough"
-    assert decide(observed, replace(WANTED, residual_px=0.99 * predicted_px)).kind == "visit"
+def test_enough_is_known_when_the_predicted_residual_is_the_wanted_one(observed: Observations, decided: Decision):
+    for share, kind in ((1.01, "enough"), (0.99, "visit")):
+        assert decide(observed, replace(WANTED, residual_px=share * decided.predicted_px)).kind == kind

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -27,11 +29,13 @@ def seed(request: pytest.FixtureRequest) -> int:
     return int(request.param)
 
 
-def narrow(seed: int) -> ThermalModel:
+@cache
+def narrow(seed: int) -> tuple[ThermalModel, Night]:
+    """A model and the night it was fitted to; the same for all tests, who read them only."""
     made = night(drawn_camera(seed), [*warm_up(), *reference(), *cycle(NARROW_DEGC, (20, 34, 41))], seed)
     model = fit(made.observed, form="thermal")
     assert isinstance(model, ThermalModel)
-    return model
+    return model, made
 
 
 def far(seed: int) -> Night:
@@ -52,22 +56,20 @@ def asked(model: ThermalModel, made: Night) -> tuple[Float, Float, Float]:
 
 
 def test_a_set_point_that_was_not_fitted_is_flagged_and_less_certain(seed: int) -> None:
-    model = narrow(seed)
+    model, _ = narrow(seed)
     _, variance, flags = asked(model, far(seed))
     assert (flags != 0).all()
     assert variance.mean() > 1.5 * (model.discrepancy_px**2).mean()
 
 
 def test_few_held_out_set_points_between_fitted_ones_are_flagged(seed: int) -> None:
-    made = night(drawn_camera(seed), [*warm_up(), *reference(), *cycle(NARROW_DEGC, (20, 34, 41))], seed)
-    model = fit(made.observed, form="thermal")
-    assert isinstance(model, ThermalModel)
+    model, made = narrow(seed)
     flags = asked(model, made)[2].astype(int)
     assert ((flags & int(Outside.STATE | Outside.CAMERA)) == 0).mean() > 0.8
 
 
 def test_a_form_without_lags_knows_the_range_of_the_air() -> None:
-    model = narrow(2)
+    model, _ = narrow(2)
     assert model.memory.taus_s
     assert model.valid.ambient_degC[0] > 16
     assert model.valid.ambient_degC[1] < 46

@@ -12,6 +12,7 @@ from markers.bootstrap import Candidates
 from markers.grid import DetectionError, Identified, identify, roll_deg
 from markers.placement import placements
 from markers.target import OddMarker, Target, load_target
+from tests.nightly import by_night
 
 from .rendered import Float, Scene, true_centres_px
 
@@ -132,16 +133,17 @@ def test_a_missing_column_is_refused_and_the_frame_before_settles_it():
     assert wrong(found, candidates, truth) == 0
 
 
-def test_a_side_that_clutter_hides_is_found_or_refused_and_never_read_one_column_off():
+@pytest.mark.parametrize("seeds", [range(6), by_night(range(6, 12))])
+def test_a_side_that_clutter_hides_is_found_or_refused_and_never_read_one_column_off(seeds: range):
     outcomes: list[int] = []
-    for seed in range(12):
+    for seed in seeds:
         candidates, truth = seen(Scene(roll_deg=5), seed, clutter=60)
         try:
             found = identify(candidates, PAPER)
         except DetectionError:
             continue
         outcomes.append(wrong(found, candidates, truth))
-    assert len(outcomes) >= 10
+    assert len(outcomes) >= 5
     assert set(outcomes) == {0}
 
 

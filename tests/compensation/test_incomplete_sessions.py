@@ -12,7 +12,7 @@ from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 
 from .conftest import SEQUENCE, Recorded
-from .test_apply import paper
+from .made_up_models import paper
 
 runner = CliRunner()
 

@@ -128,8 +128,9 @@ def test_a_session_without_or_with_a_wrong_target_is_refused(tmp_path: Path):
         session_target(Session.open(tmp_path / "wrong"))
 
 
-def test_a_session_that_never_shows_the_target_is_refused(recorded: Recorded):
-    session = Session.open(recorded.path)
+def test_a_session_that_never_shows_the_target_is_refused(tmp_path: Path):
+    asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=3))
+    session = Session.open(tmp_path / "night")
     with pytest.raises(SessionError, match="no frame can be used"):
         observe_session(session, session_target(session).model_copy(update={"columns": 12, "minimum_markers": 72}))
 

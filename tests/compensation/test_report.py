@@ -33,8 +33,8 @@ from compensation.reporting.report import can_be_fitted, check_report_writable, 
 from compensation.reporting.result_section import result_section
 from foundation.errors import SessionError
 
+from .made_up_models import thermal
 from .synthetic import facts, observations, places_px, quadratic
-from .test_apply import thermal
 
 Analysed = tuple[Observations, PaperModel, Evaluation]
 BUDGET = Budget(
@@ -216,6 +216,7 @@ def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers
         assert row in page
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
     cold = warm_up_only()
     assert not can_be_fitted(cold)
@@ -252,6 +253,7 @@ def test_a_session_without_any_drift_is_reported_all_the_same(role: str):
     assert f"({12 + 8} {role})" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("role", ["fit", "other"])
 def test_frames_of_ones_own_steps_without_a_reference_are_shown_over_time(role: str):
     own = warm_up_only(roles=(role,))

@@ -20,8 +20,8 @@ from compensation.apply.ros2_package import export_ros2
 from compensation.apply.runtime_export import runtime_model
 from compensation.drift_runtime import Drift
 
+from .made_up_models import thermal
 from .ros2_stub import MESSAGES, Header, Point32, Polygon, StubNode, Time, stub_modules
-from .test_apply import thermal
 
 PLACES = np.array([[320.0, 200.0], [5.0, 5.0]])
 K = np.array([[900.0, 0.0, 319.0], [0.0, 905.0, 241.0], [0.0, 0.0, 1.0]])

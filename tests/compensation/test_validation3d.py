@@ -147,6 +147,7 @@ def test_the_drift_models_uncertainty_reaches_the_pose(laboratory: Laboratory, c
     assert places.std(axis=0) == pytest.approx(1e3 * np.sqrt(np.diagonal(claimed)[3:]), rel=0.15)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_pose_that_was_not_seen_is_left_out_of_the_means_and_shown_as_unknown(
     laboratory: Laboratory, camera: Camera, model: PaperModel
 ):

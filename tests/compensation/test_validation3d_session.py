@@ -174,6 +174,7 @@ def test_validate_writes_the_page_and_the_numbers_beside_it(folder: Path, tmp_pa
         assert 0.05 * extra_um < z_um < 0.25 * extra_um
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_rays_give_the_same_without_the_stand(folder: Path, tmp_path: Path):
     result = run(folder, folder / "session", tmp_path / "validation.html", "--lens", "rays")
     assert result.exit_code == 0, result.output
@@ -209,6 +210,7 @@ def recorded_alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_silent_thermometer_is_named_where_it_is_needed(folder: Path, tmp_path: Path):
     asyncio.run(record(tmp_path / "silent", silent="artifact"))
     out = tmp_path / "validation.html"
@@ -218,6 +220,7 @@ def test_a_silent_thermometer_is_named_where_it_is_needed(folder: Path, tmp_path
     assert run(folder, tmp_path / "silent", out).exit_code == 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_session_with_something_missing_is_validated_only_when_that_is_asked_for(folder: Path, tmp_path: Path):
     session = Path(shutil.copytree(folder / "session", tmp_path / "session"))
     (session / "frames" / "0001.mcap.part").write_bytes(b"what a killed recorder left")
