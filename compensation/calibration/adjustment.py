@@ -99,13 +99,26 @@ class _Round:
     is_explained: bool
 
 
-def adjust(positions: Positions, board: Board, sigma: TableSigma, *, rational: bool = False) -> Adjustment:
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Where an adjustment begins: Brown's camera and the table, with the corrections (P, N, 2), px, by homographies."""
+
+    scene: Scene
+    shifts_px: Float
+
+
+def adjust(
+    positions: Positions, board: Board, sigma: TableSigma, *, rational: bool = False, start: Start | None = None
+) -> Adjustment:
     """Calibrate: OpenCV and the target's poses give the start, then everything is adjusted together.
 
-    Rounds follow until the eccentricity of the discs, the outliers and the discrepancy are settled. CalibrationError
-    when the observations do not determine a camera.
+    start: of these positions, where it is known already. Rounds follow until the eccentricity of the discs, the
+    outliers and the discrepancy are settled. CalibrationError when the observations do not determine a camera.
     """
-    scene, shifts = _start(positions, board, rational=rational)
+    start = start or start_of(positions, board)
+    scene, shifts = start.scene, start.shifts_px
+    if rational:
+        scene = replace(scene, lens=Pinhole(np.concatenate([scene.lens.vector, np.zeros(3)]), scene.lens.image_size))
     found = _adjusted(scene, positions, board, sigma, shifts, positions.seen, 0.0)
     for _ in range(_ROUNDS):
         scene = found.solution.state
@@ -141,7 +154,7 @@ def _adjusted(
     discrepancy_px: float,
 ) -> _Round:
     problem = problem_of(positions, shifts_px, used, board, sigma, discrepancy_px, start.lens)
-    solution = minimise(start, problem.residuals, problem.jacobian, problem.stepped)
+    solution = minimise(start, problem.residuals, problem.equations, problem.stepped)
     degrees = problem.count - len(solution.covariance)
     chi2 = solution.cost / degrees
     excess = max(chi2, _board_excess(solution, board))
@@ -171,20 +184,17 @@ def _board_excess(solution: Solution[Scene], board: Board) -> float:
     return float(np.sum(moved[:, :2] ** 2)) / free - 3 * np.sqrt(2 / free)
 
 
-def _start(positions: Positions, board: Board, *, rational: bool) -> tuple[Scene, Float]:
-    """Camera and poses by OpenCV, of centres corrected by the homographies; and these corrections (P, N, 2)."""
+def start_of(positions: Positions, board: Board) -> Start:
+    """Camera and poses by OpenCV, of centres corrected by the homographies."""
     shifts = np.array(
         [shifts_by_homography(centres, board.points_mm, board.diameters_mm) for centres in positions.centres_px]
     )
     centres = positions.centres_px - shifts
     start = calibrate_opencv(centres, board.points_mm, positions.image_size)
-    lens = start.lens
-    if rational:
-        lens = Pinhole(np.concatenate([lens.vector, np.zeros(3)]), lens.image_size)
     table = table_from_poses(
         positions.linear_mm, positions.rotary_deg, start.rotations, start.translations_mm, board.points_mm.mean(axis=0)
     )
-    return Scene(lens, table, np.zeros((len(centres), ERRORS)), board.points_mm), shifts
+    return Start(Scene(start.lens, table, np.zeros((len(centres), ERRORS)), board.points_mm), shifts)
 
 
 def _residuals(scene: Scene, positions: Positions, shifts_px: Float) -> Float:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import yaml
 
-from compensation.calibration.least_squares import Float, minimise
+from compensation.calibration.least_squares import Float, dense, minimise
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.uncertainty import grid_pixels
 from foundation.files import make_folder, write_whole
@@ -48,7 +48,7 @@ def refit_radtan(lens: Pinhole) -> Refit:
     solution = minimise(
         Pinhole(vector, lens.image_size),
         lambda state: (state.project(points) - pixels[kept]).ravel() / 1e-6,
-        lambda state: state.vector_jacobian(points)[:, :, :8].reshape(-1, 8) / 1e-6,
+        dense(lambda state: state.vector_jacobian(points)[:, :, :8].reshape(-1, 8) / 1e-6),
         step,
     )
     off = solution.state.project(points) - pixels[kept]

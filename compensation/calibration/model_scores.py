@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from compensation.calibration.adjustment import Adjustment, adjust
+from compensation.calibration.adjustment import Adjustment, adjust, start_of
 from compensation.calibration.board import Board
 from compensation.calibration.least_squares import Float
 from compensation.calibration.pose import Lens, find_pose
@@ -74,8 +74,9 @@ def ray_name(degree: int) -> str:
 
 
 def _models(positions: Positions, board: Board, sigma: TableSigma) -> list[tuple[str, Lens, Board]]:
-    brown = adjust(positions, board, sigma)
-    rational = adjust(positions, board, sigma, rational=True)
+    start = start_of(positions, board)
+    brown = adjust(positions, board, sigma, start=start)
+    rational = adjust(positions, board, sigma, rational=True, start=start)
     rays = [(ray_name(degree), rays_of(brown, degree), brown.adjusted_board) for degree in DEGREES]
     return [
         (BROWN, brown.scene.lens, brown.adjusted_board),

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from compensation.calibration.board import Board
 from compensation.calibration.centre_corrections import shifts_by_camera
-from compensation.calibration.least_squares import Float, minimise, whiteners
+from compensation.calibration.least_squares import Float, dense, minimise, whiteners
 from compensation.calibration.rotation import crosses
 from foundation.errors import CalibrationError
 
@@ -123,7 +123,7 @@ def _refined(
             Rotation.from_rotvec(change[:3]).as_matrix() @ placed.rotation, placed.translation_mm + change[3:]
         )
 
-    solution = minimise(start, residuals, jacobian, stepped)
+    solution = minimise(start, residuals, dense(jacobian), stepped)
     off = lens.misfit(_seen_points(solution.state, points_mm), pixels)
     return _Refined(solution.state, solution.covariance, solution.cost, off)
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from compensation.calibration.board import Board
 from compensation.calibration.bundle import lens_sigma
 from compensation.calibration.centre_corrections import shifts_by_camera
-from compensation.calibration.least_squares import Float, minimise, next_discrepancy, whiteners
+from compensation.calibration.least_squares import Float, dense, minimise, next_discrepancy, whiteners
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.rotation import crosses
 from compensation.calibration.views import LEAST_MARKERS, POSE, Views, calibrate_views, inliers
@@ -170,7 +170,7 @@ def _round(
     ]
     seen = [_Seen(*one) for one in zip(range(len(cameras)), cameras, shifts, used, discrepancies, strict=True)]
     problem = _Problem(seen, board, tuple(lens_sigma(lens) for lens in scene.lenses))
-    solution = minimise(scene, problem.residuals, problem.jacobian, problem.stepped)
+    solution = minimise(scene, problem.residuals, dense(problem.jacobian), problem.stepped)
     state = solution.state
     free = 1 - len(solution.covariance) / len(problem.residuals(state))
     chi2 = np.array([float(np.mean(one.residuals(state) ** 2)) / free for one in seen], np.float64)

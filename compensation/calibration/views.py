@@ -21,6 +21,7 @@ from compensation.calibration.centre_corrections import shifts_by_camera, shifts
 from compensation.calibration.least_squares import (
     Float,
     Solution,
+    dense,
     lengths_in_sigmas,
     minimise,
     next_discrepancy,
@@ -151,7 +152,7 @@ def _round(
         scene.lens.project, scene.rotations, scene.translations_mm, scene.points_mm, board.diameters_mm
     )
     problem = _problem(views, shifts, used, board, discrepancy_px, scene.lens)
-    solution = minimise(scene, problem.residuals, problem.jacobian, problem.stepped)
+    solution = minimise(scene, problem.residuals, dense(problem.jacobian), problem.stepped)
     chi2 = solution.cost / (problem.count - len(solution.covariance))
     return solution, _residuals(solution.state, views.centres_px - shifts), chi2
 

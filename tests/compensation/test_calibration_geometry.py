@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from compensation.calibration.adjustment import Scene
 from compensation.calibration.board import Board
-from compensation.calibration.bundle import problem_of
+from compensation.calibration.bundle import Problem, Scene, problem_of
 from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from compensation.calibration.hand_eye import table_from_poses
-from compensation.calibration.least_squares import minimise
+from compensation.calibration.least_squares import Float, dense, minimise
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.pose import find_pose
 from compensation.calibration.rays import fit_rays
@@ -94,10 +93,30 @@ def test_directions_across_an_axis_are_at_right_angles():
     assert np.abs(frame.T @ frame - np.eye(3)).max() < 1e-12
 
 
+def written_out(problem: Problem, scene: Scene) -> Float:
+    """The derivatives of all residuals of the adjustment, nearly all of them zeros."""
+    slopes, count, free = problem.slopes(scene), len(problem.position), int(problem.freed.sum())
+    lens, first_error = len(scene.lens.vector), slopes.common.shape[2]
+    first_point = first_error + free * len(scene.errors)
+    matrix = np.zeros((problem.count, first_point + scene.points_mm.size))
+    for index, (position, marker) in enumerate(zip(problem.position, problem.marker, strict=True)):
+        own = slice(2 * index, 2 * index + 2)
+        matrix[own, :first_error] = slopes.common[index]
+        matrix[own, first_error + free * position : first_error + free * (position + 1)] = slopes.errors[index]
+        matrix[own, first_point + 3 * marker : first_point + 3 * marker + 3] = slopes.points[index]
+    errors = np.tile(1 / problem.errors_sigma[problem.freed], len(scene.errors))
+    priors = np.concatenate([1 / problem.lens_sigma, errors, 1 / problem.sigma_mm.ravel()])
+    columns = [*range(4, lens), *range(first_error, matrix.shape[1])]
+    matrix[np.arange(2 * count, problem.count), columns] = priors
+    return matrix
+
+
 def test_the_adjustments_derivatives_are_those_of_small_steps():
-    """Every column of the whole problem, at a state with errors in it."""
+    """Every column of the whole problem, at a state with errors in it and without one marker; and the equations are
+    those of these derivatives."""
     laboratory = draw(Truth(seed=1))
     seen = positions(laboratory).part(np.arange(34) % 4 == 0)
+    seen.centres_px[2, 7] = np.nan
     table = table_from_poses(
         seen.linear_mm, seen.rotary_deg, laboratory.rotations[::4], laboratory.translations_mm[::4], MIDDLE
     )
@@ -107,8 +126,12 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
     scene = Scene(RATIONAL, table, errors, known.points_mm)
     sigma = TableSigma(0.0005, 0.1, 0.001, 0.2)
     problem = problem_of(seen, np.zeros_like(seen.centres_px), seen.seen, known, sigma, 0.0, RATIONAL)
-    jacobian = problem.jacobian(scene)
-    assert len(jacobian) == len(problem.residuals(scene)) == problem.count
+    jacobian, residuals = written_out(problem, scene), problem.residuals(scene)
+    assert len(jacobian) == len(residuals) == problem.count
+    normal, gradient = problem.equations(scene, residuals)
+    scale = np.sqrt(np.diag(normal))
+    assert np.abs((normal - jacobian.T @ jacobian) / scale / scale[:, None]).max() < 1e-12
+    assert np.abs(gradient - jacobian.T @ residuals).max() < 1e-12 * np.abs(gradient).max()
     for column in range(jacobian.shape[1]):
         size = 1e-6 / max(1e-6, np.abs(jacobian[:, column]).max()) * 1e3
         step = size * np.eye(jacobian.shape[1])[column]
@@ -168,7 +191,10 @@ def test_too_few_markers_give_no_pose():
 def test_a_parameter_that_nothing_depends_on_is_refused():
     with pytest.raises(CalibrationError, match="do not determine all parameters"):
         minimise(
-            np.zeros(2), lambda x: x[:1] - 1, lambda _: np.array([[1.0, 0.0]]), lambda state, change: state + change
+            np.zeros(2),
+            lambda x: x[:1] - 1,
+            dense(lambda _: np.array([[1.0, 0.0]])),
+            lambda state, change: state + change,
         )
 
 
@@ -177,7 +203,7 @@ def test_the_minimum_of_a_curved_valley_is_found():
     found = minimise(
         np.array([-1.2, 1.0]),
         lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]),
-        lambda x: np.array([[-20 * x[0], 10.0], [-1.0, 0.0]]),
+        dense(lambda x: np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])),
         lambda state, change: state + change,
     )
     assert found.state == pytest.approx([1, 1], abs=1e-3)
