@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +20,26 @@ from markers.detection import Detection, detect
 from markers.grid import project
 from markers.image_file import read_image
 from markers.target import load_target
+from tests.nightly import by_night
 
 ROOT = Path(__file__).parents[2]
 TARGET = load_target(ROOT / "configs" / "targets" / "robot-cal-tools-10x10.yaml")
 IMAGES = ROOT.parent / "shared" / "data" / "robot_cal_tools_10x10" / "images"
 
 
-COUNT = 15
+BY_DAY = (0, 4, 8, 12)
+OTHERS = (1, 2, 3, 5, 6, 7, 9, 10, 11, 13, 14)
 Detected = tuple[Path, list[Detection]]
 
 
 @pytest.fixture(scope="module")
-def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
-    """The table that `compensate detect` writes of all the photographs, and the detections it was written from."""
-    paths = [IMAGES / f"{number}.png" for number in range(COUNT)]
+def detected_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[int, ...]], Detected]:
+    return cache(lambda numbers: detected(numbers, tmp_path_factory.mktemp("photographs") / "markers.csv"))
+
+
+def detected(numbers: tuple[int, ...], out: Path) -> Detected:
+    """The table that `compensate detect` writes of these photographs, and the detections it was written from."""
+    paths = [IMAGES / f"{number}.png" for number in numbers]
     for path in paths:
         if not path.exists():
             if os.environ.get("CI") == "true":
@@ -43,7 +51,6 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
         detections.append(detect(*arguments, **options))
         return detections[-1]
 
-    out = tmp_path_factory.mktemp("photographs") / "markers.csv"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(detect_cli, "detect", kept)
         arguments = ["detect", *map(str, paths), "--target", "robot-cal-tools-10x10", "-o", str(out)]
@@ -56,20 +63,29 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Detected:
     return out, detections
 
 
-def test_noise_does_not_describe_webcam_pictures_of_a_print_and_that_is_said(detected: Detected):
-    assert sum(one.is_doubtful for one in detected[1]) >= COUNT - 1
+@pytest.mark.parametrize(("numbers", "doubtless"), [(BY_DAY, 0), by_night(OTHERS, 1)])
+def test_noise_does_not_describe_webcam_pictures_of_a_print_and_that_is_said(
+    numbers: tuple[int, ...], doubtless: int, detected_of: Callable[[tuple[int, ...]], Detected]
+):
+    assert [one.is_doubtful for one in detected_of(numbers)[1]].count(False) <= doubtless
 
 
-@pytest.fixture(params=range(COUNT), ids="{}.png".format)
-def photograph(request: pytest.FixtureRequest, detected: Detected) -> tuple[np.ndarray, Detection]:
-    return read_image(IMAGES / f"{request.param}.png"), detected[1][request.param]
+@pytest.fixture(params=[*BY_DAY, *map(by_night, OTHERS)], ids="{}.png".format)
+def photograph(
+    request: pytest.FixtureRequest, detected_of: Callable[[tuple[int, ...]], Detected]
+) -> tuple[np.ndarray, Detection]:
+    numbers = BY_DAY if request.param in BY_DAY else OTHERS
+    return read_image(IMAGES / f"{request.param}.png"), detected_of(numbers)[1][numbers.index(request.param)]
 
 
-def test_the_table_has_every_marker_of_every_photograph(detected: Detected):
-    with detected[0].open(newline="") as file:
+@pytest.mark.parametrize("numbers", [BY_DAY, by_night(OTHERS)])
+def test_the_table_has_every_marker_of_every_photograph(
+    numbers: tuple[int, ...], detected_of: Callable[[tuple[int, ...]], Detected]
+):
+    with detected_of(numbers)[0].open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 100 * COUNT
-    for number in range(COUNT):
+    assert len(rows) == 100 * len(numbers)
+    for number in numbers:
         own = [row for row in rows if row["image"] == f"{number}.png"]
         assert [int(row["marker"]) for row in own] == list(range(1, 101))
         assert not [row for row in own if row["x_px"] == "nan" or "MISSING" in row["flags"].split("|")]
