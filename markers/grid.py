@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from foundation.errors import DetectionError
 from markers.bootstrap import Candidates
@@ -173,7 +174,7 @@ def _by_roll(placements: list[Placement], target: Target, previous: Float | None
 
 def _checked(chosen: Placement, points: Float, target: Target) -> Identified:
     """Without what lies off the place that the others give it: clutter in line with the grid."""
-    candidate = settled(chosen.candidate, points, target)
+    candidate = settled(chosen.candidate, points, KDTree(points), target)
     kept = candidate >= 0
     _require(int(kept.sum()), target)
     return Identified(candidate, fit_homography(target.coordinates_mm()[kept], points[candidate[kept]]))

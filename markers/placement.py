@@ -77,10 +77,10 @@ def _placed(tables: list[Index], points: Float, target: Target) -> list[Placemen
 def _settled(tables: list[Index], points: Float, target: Target) -> list[Index]:
     most = max((_seen(table) for table in tables), default=0)
     near = [table for table in tables if _seen(table) >= max(LEAST_SEEN, _WORTH_SETTLING * most)]
-    possible: list[Index] = []
+    tree, possible = KDTree(points), list[Index]()
     for table in near:
         with suppress(DetectionError):
-            possible.append(settled(table, points, target))
+            possible.append(settled(table, points, tree, target))
     return possible
 
 
@@ -126,13 +126,13 @@ def placement(candidate: Index, points: Float, target: Target) -> Placement:
     return Placement(candidate, homography, float(np.sqrt(np.mean(off**2))) + _MISSING_PX * missing)
 
 
-def settled(candidate: Index, points: Float, target: Target) -> Index:
+def settled(candidate: Index, points: Float, tree: KDTree, target: Target) -> Index:
     """Each marker's candidate chosen again: the one nearest to where all others put it, -1 when none is near enough.
+    tree: of the points.
 
     Clutter in line with the grid goes, and a marker that the growth did not reach comes.
     """
     target_mm = target.coordinates_mm()
-    tree = KDTree(points)
     for own_place in _OWN_PLACE:
         seen = candidate >= 0
         if seen.sum() < LEAST_SEEN:

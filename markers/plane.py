@@ -96,5 +96,7 @@ def to_image(target_mm: Float, centres_px: Float, homography: Float) -> Callable
 
 def _monomials(points: Float, low: Float, high: Float, degree: int) -> Float:
     """x^i y^j, i + j <= degree, of points (K, 2) scaled so that low and high are -1 and 1; shape (K, terms)."""
-    x, y = ((2 * points - low - high) / (high - low)).T
-    return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    scaled = (2 * points - low - high) / (high - low)
+    powers = [scaled**exponent for exponent in range(degree + 1)]
+    pairs = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    return np.stack([powers[i][:, 0] * powers[j][:, 1] for i, j in pairs], axis=1)
