@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.calibration.blocks import Slopes, equations_of
 from compensation.calibration.board import Board
 from compensation.calibration.least_squares import Float, whiteners
 from compensation.calibration.pinhole import Pinhole
@@ -34,16 +35,6 @@ class Scene:
     table: Table
     errors: Float
     points_mm: Float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Slopes:
-    """Derivatives of M whitened markers: common (M, 2, C) with respect to camera and table, errors (M, 2, F) to the
-    free errors of the marker's position, points (M, 2, 3) to its board point."""
-
-    common: Float
-    errors: Float
-    points: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,49 +81,24 @@ class Problem:
         by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
         by_lens = self.whitener @ scene.lens.vector_jacobian(seen)
         return Slopes(
+            self.position,
+            self.marker,
             np.concatenate([by_lens, by_point @ to_table], axis=2),
             by_point @ to_errors[:, :, self.freed],
             by_point @ to_points,
         )
 
     def equations(self, scene: Scene, residuals: Float) -> tuple[Float, Float]:
-        """Normal matrix (n, n) and gradient (n,) of a step of camera, table, free table errors and board points.
-
-        A marker is moved by camera, table, the errors of its position and its board point only: the sums run over
-        these, not over the rows of a derivative that is nearly all zeros.
-        """
-        own, positions, markers = self.slopes(scene), len(self.linear_mm), len(self.prior_mm)
-        common, errors, points = (_placed(self, part) for part in (own.common, own.errors, own.points))
-        off, first_error = _placed(self, residuals[: 2 * len(self.position)].reshape(-1, 2, 1)), common.shape[-1]
-        by_position = [part.reshape(positions, 2 * markers, part.shape[-1]) for part in (common, errors, off)]
-        by_marker = [
-            np.swapaxes(part, 0, 1).reshape(markers, 2 * positions, part.shape[-1]) for part in (common, points, off)
-        ]
-        to_errors, to_points = np.swapaxes(by_position[1], 1, 2), np.swapaxes(by_marker[1], 1, 2)
-        flat = common.reshape(-1, first_error)
-        crossed = np.swapaxes(errors, 2, 3) @ points
-        normal = _symmetric(
-            flat.T @ flat,
-            np.concatenate([_rows(to_errors @ by_position[0]), _rows(to_points @ by_marker[0])]).T,
-            _block_diagonal(to_errors @ by_position[1]),
-            np.swapaxes(crossed, 1, 2).reshape(-1, 3 * markers),
-            _block_diagonal(to_points @ by_marker[1]),
-        )
-        gradient = np.concatenate(
-            [flat.T @ off.ravel(), (to_errors @ by_position[2]).ravel(), (to_points @ by_marker[2]).ravel()]
-        )
-        known, weights = self._priors(scene, first_error)
-        normal[known, known] += weights**2
-        gradient[known] += weights * residuals[2 * len(self.position) :]
-        return normal, gradient
-
-    def _priors(self, scene: Scene, first_error: int) -> tuple[NDArray[np.int64], Float]:
-        """Which parameters have one, and what a step of them is multiplied by in its residual."""
-        lens = len(scene.lens.vector)
+        """Normal matrix (n, n) and gradient (n,) of a step of camera, table, free table errors and board points."""
+        off = residuals[: 2 * len(self.position)].reshape(-1, 2)
+        normal, gradient = equations_of(self.slopes(scene), off, len(self.linear_mm), len(self.prior_mm))
         errors = np.tile(1 / self.errors_sigma[self.freed], len(scene.errors))
         weights = np.concatenate([1 / self.lens_sigma, errors, 1 / self.sigma_mm.ravel()])
-        others = np.arange(first_error, first_error + len(weights) - (lens - 4))
-        return np.concatenate([np.arange(4, lens), others]), weights
+        lens, others = len(scene.lens.vector), len(weights) - len(self.lens_sigma)
+        known = np.concatenate([np.arange(4, lens), np.arange(len(normal) - others, len(normal))])
+        normal[known, known] += weights**2
+        gradient[known] += weights * residuals[off.size :]
+        return normal, gradient
 
     def stepped(self, scene: Scene, change: Float) -> Scene:
         """The scene a step (n,) away."""
@@ -175,33 +141,6 @@ def problem_of(
         errors_sigma=np.where(freed, sigma_vector, 1.0),
         lens_sigma=lens_sigma(lens),
     )
-
-
-def _placed(problem: Problem, values: Float) -> Float:
-    """(P, N, 2, K) of (M, 2, K): 0 where a marker is not used."""
-    placed = np.zeros((len(problem.linear_mm), len(problem.prior_mm), *values.shape[1:]))
-    placed[problem.position, problem.marker] = values
-    return placed
-
-
-def _rows(blocks: Float) -> Float:
-    """(B K, C) of blocks (B, K, C)."""
-    return blocks.reshape(-1, blocks.shape[-1])
-
-
-def _block_diagonal(blocks: Float) -> Float:
-    """(B K, B K) of blocks (B, K, K)."""
-    count, size, _ = blocks.shape
-    matrix = np.zeros((count, size, count, size))
-    each = np.arange(count)
-    matrix[each, :, each] = blocks
-    return matrix.reshape(count * size, count * size)
-
-
-def _symmetric(common: Float, beside: Float, errors: Float, crossed: Float, points: Float) -> Float:
-    """The whole matrix of its blocks on the diagonal and above it."""
-    lower = np.block([[errors, crossed], [crossed.T, points]])
-    return np.block([[common, beside], [beside.T, lower]])
 
 
 def _seen_points(scene: Scene, problem: Problem) -> Float:

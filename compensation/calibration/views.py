@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from compensation.calibration.blocks import Slopes, equations_of
 from compensation.calibration.board import Board
 from compensation.calibration.bundle import lens_sigma
 from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from compensation.calibration.least_squares import (
     Float,
     Solution,
-    dense,
     lengths_in_sigmas,
     minimise,
     next_discrepancy,
@@ -152,7 +152,7 @@ def _round(
         scene.lens.project, scene.rotations, scene.translations_mm, scene.points_mm, board.diameters_mm
     )
     problem = _problem(views, shifts, used, board, discrepancy_px, scene.lens)
-    solution = minimise(scene, problem.residuals, dense(problem.jacobian), problem.stepped)
+    solution = minimise(scene, problem.residuals, problem.equations, problem.stepped)
     chi2 = solution.cost / (problem.count - len(solution.covariance))
     return solution, _residuals(solution.state, views.centres_px - shifts), chi2
 
@@ -205,24 +205,29 @@ class _Problem:
         board = (scene.points_mm - self.prior_mm) / self.sigma_mm
         return np.concatenate([off.ravel(), scene.lens.distortion / self.lens_sigma, board.ravel()])
 
-    def jacobian(self, scene: Posed) -> Float:
+    def slopes(self, scene: Posed) -> Slopes:
+        """Derivatives of the markers' residuals with respect to camera, pose and board point."""
         turned, seen = self._points(scene)
-        lens, rows = len(scene.lens.vector), len(self.view)
-        first_point = lens + POSE * len(scene.rotations)
-        count = first_point + scene.points_mm.size
         by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
-        slopes = np.zeros((rows, 2, count))
-        slopes[:, :, :lens] = self.whitener @ scene.lens.vector_jacobian(seen)
-        each = np.arange(rows)[:, None]
-        pose = np.concatenate([-by_point @ crosses(turned), by_point], axis=2)
-        slopes[each, :, lens + POSE * self.view[:, None] + np.arange(POSE)] = np.swapaxes(pose, 1, 2)
-        points = by_point @ scene.rotations[self.view]
-        slopes[each, :, first_point + 3 * self.marker[:, None] + np.arange(3)] = np.swapaxes(points, 1, 2)
-        priors = np.zeros((len(self.lens_sigma) + self.prior_mm.size, count))
-        known = len(self.lens_sigma)
-        priors[range(known), range(lens - known, lens)] = 1 / self.lens_sigma
-        priors[range(known, len(priors)), range(first_point, count)] = 1 / self.sigma_mm.ravel()
-        return np.concatenate([slopes.reshape(-1, count), priors])
+        return Slopes(
+            self.view,
+            self.marker,
+            self.whitener @ scene.lens.vector_jacobian(seen),
+            np.concatenate([-by_point @ crosses(turned), by_point], axis=2),
+            by_point @ scene.rotations[self.view],
+        )
+
+    def equations(self, scene: Posed, residuals: Float) -> tuple[Float, Float]:
+        """Normal matrix (n, n) and gradient (n,) of a step of camera, poses and board points."""
+        off = residuals[: 2 * len(self.view)].reshape(-1, 2)
+        normal, gradient = equations_of(self.slopes(scene), off, len(scene.rotations), len(self.prior_mm))
+        lens, count = len(scene.lens.vector), len(normal)
+        board = np.arange(count - self.prior_mm.size, count)
+        known = np.concatenate([np.arange(lens - len(self.lens_sigma), lens), board])
+        weights = np.concatenate([1 / self.lens_sigma, 1 / self.sigma_mm.ravel()])
+        normal[known, known] += weights**2
+        gradient[known] += weights * residuals[off.size :]
+        return normal, gradient
 
     def stepped(self, scene: Posed, change: Float) -> Posed:
         lens = len(scene.lens.vector)

@@ -102,7 +102,7 @@ def written_out(problem: Problem, scene: Scene) -> Float:
     for index, (position, marker) in enumerate(zip(problem.position, problem.marker, strict=True)):
         own = slice(2 * index, 2 * index + 2)
         matrix[own, :first_error] = slopes.common[index]
-        matrix[own, first_error + free * position : first_error + free * (position + 1)] = slopes.errors[index]
+        matrix[own, first_error + free * position : first_error + free * (position + 1)] = slopes.own[index]
         matrix[own, first_point + 3 * marker : first_point + 3 * marker + 3] = slopes.points[index]
     errors = np.tile(1 / problem.errors_sigma[problem.freed], len(scene.errors))
     priors = np.concatenate([1 / problem.lens_sigma, errors, 1 / problem.sigma_mm.ravel()])
