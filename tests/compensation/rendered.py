@@ -212,5 +212,7 @@ def photograph(
     """`clean` with read and shot noise, rounded and clipped."""
     rng = np.random.default_rng(seed)
     sigma = np.sqrt(scene.read_DN**2 + np.maximum(clean, 0) / scene.electrons_per_DN)
-    noisy = clean + sigma * rng.standard_normal(clean.shape)
-    return np.clip(np.round(noisy), 0, np.iinfo(dtype).max).astype(dtype)  # pyright: ignore[reportReturnType] - of one of the two
+    noisy = rng.standard_normal(clean.shape)
+    noisy *= sigma
+    noisy += clean
+    return np.clip(np.rint(noisy, out=noisy), 0, np.iinfo(dtype).max, out=noisy).astype(dtype)  # pyright: ignore[reportReturnType] - of one of the two

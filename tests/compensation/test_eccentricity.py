@@ -1,6 +1,7 @@
 """Discs' centres from ellipses' centres, against the reference renderer's projection."""
 
 import dataclasses
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,11 @@ TILTED = {
 }
 
 
+@cache
+def found_at(tilt_deg):
+    return detect(photograph(TILTED[tilt_deg], render(TILTED[tilt_deg]), 1), PAPER)
+
+
 def middles_px(scene):
     return project(scene, scene.discs_mm()[:, :2])
 
@@ -29,8 +35,7 @@ def rms_mpx(errors_px):
 
 @pytest.mark.parametrize("tilt_deg", TILTED)
 def test_the_homography_gives_the_centres_of_the_discs(tilt_deg):
-    scene = TILTED[tilt_deg]
-    found = detect(photograph(scene, render(scene), 1), PAPER)
+    scene, found = TILTED[tilt_deg], found_at(tilt_deg)
     assert rms_mpx(found.centres_px - middles_px(scene)) > 30, "without the correction the test would prove nothing"
     assert rms_mpx(disc_centres_px(found, PAPER) - middles_px(scene)) < 3.2
 
@@ -43,8 +48,7 @@ def test_a_lens_that_distorts_leaves_no_more_than_the_noise():
 
 
 def test_without_noise_the_correction_is_exact_and_missing_markers_stay_missing():
-    scene = TILTED[30]
-    seen = detect(photograph(scene, render(scene), 1), PAPER)
+    scene, seen = TILTED[30], found_at(30)
     centres_px = true_centres_px(scene)
     centres_px[7] = np.nan
     corrected = disc_centres_px(dataclasses.replace(seen, centres_px=centres_px), PAPER)

@@ -38,7 +38,7 @@ def png(width: int, height: int, depth: int = 8, colour: int = 0, pixels: bytes 
     """All black; `pixels` instead of what such an image has."""
     samples = {0: 1, 2: 3, 6: 4}[colour]
     if pixels is None:
-        packer = zlib.compressobj(9)
+        packer = zlib.compressobj(1)
         row = bytes(1 + (width * samples * depth + 7) // 8)
         pixels = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)

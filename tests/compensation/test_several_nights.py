@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -11,27 +12,29 @@ from compensation.drift.thermal_model import ThermalModel
 from compensation.drift.training import frame_states
 from compensation.observations import concatenate
 
-from .drawn_cameras import Camera, drawn_camera
+from .drawn_cameras import drawn_camera
 from .drawn_nights import Night, full_night, night
 
 SEED = 2700
 
 
-def made(camera: Camera, number: int) -> Night:
+@cache
+def made(number: int) -> Night:
     """The image of each night is larger by a part that no temperature explains, along J and towards the edges of the
-    cycle: 0.5 mpx/K of the set-point in every other night."""
-    one = night(camera, full_night(), 10 * SEED + number, session_id=f"night-{number}")
+    cycle: 0.5 mpx/K of the set-point in every other night. The same for all tests, who read it only."""
+    one = night(drawn_camera(SEED), full_night(), 10 * SEED + number, session_id=f"night-{number}")
     away_K = one.observed.chamber_degC - 24.0
     shift = (0.0005 if number % 2 else -0.0005) * away_K[:, None, None] * np.array([0.0, 1.0])
     return Night(replace(one.observed, centres_px=one.observed.centres_px + shift), one.truth_px + shift)
 
 
+@cache
 def thermal(*nights: Night) -> ThermalModel:
     return fit_thermal(concatenate([one.observed for one in nights]))
 
 
 def test_what_does_not_repeat_between_nights_is_claimed() -> None:
-    nights = [made(drawn_camera(SEED), number) for number in range(2)]
+    nights = [made(number) for number in range(2)]
     alone, together = (model.between_nights for model in (thermal(nights[0]), thermal(*nights)))
     assert alone is not None
     assert together is not None
@@ -41,7 +44,7 @@ def test_what_does_not_repeat_between_nights_is_claimed() -> None:
 
 
 def test_it_is_added_on_another_night_only() -> None:
-    first, other = (made(drawn_camera(SEED), number) for number in range(2))
+    first, other = (made(number) for number in range(2))
     model = thermal(first)
     places, state = first.truth_px[0], frame_states(first.observed, model.memory).where(np.array([0]))
     own, any_night = model.of_sessions(["night-0"]), model.of_sessions(["night-0", "night-1"])
@@ -52,8 +55,7 @@ def test_it_is_added_on_another_night_only() -> None:
 
 
 def test_a_night_that_the_others_cannot_do_without_says_nothing() -> None:
-    camera = drawn_camera(SEED)
-    whole, few = made(camera, 0), made(camera, 1)
+    whole, few = made(0), made(1)
     far = np.abs(few.observed.chamber_degC - 24.0) > 8
     reasons = tuple("not of this night" if out else why for out, why in zip(far, few.observed.reasons, strict=True))
     short = Night(replace(few.observed, reasons=reasons), few.truth_px)
