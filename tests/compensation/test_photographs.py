@@ -75,7 +75,8 @@ def photograph(
     request: pytest.FixtureRequest, detected_of: Callable[[tuple[int, ...]], Detected]
 ) -> tuple[np.ndarray, Detection]:
     numbers = BY_DAY if request.param in BY_DAY else OTHERS
-    return read_image(IMAGES / f"{request.param}.png"), detected_of(numbers)[1][numbers.index(request.param)]
+    detection = detected_of(numbers)[1][numbers.index(request.param)]
+    return read_image(IMAGES / f"{request.param}.png"), detection
 
 
 @pytest.mark.parametrize("numbers", [BY_DAY, by_night(OTHERS)])
