@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 from foundation.clock import Clock, seconds_ns
@@ -35,6 +36,16 @@ class Harmful(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """An actuator that has not confirmed its safe state, which was demanded at since_ns. failure: why the last try did
+    not confirm it, "" while the first one is under way."""
+
+    name: str
+    since_ns: int
+    failure: str
+
+
 class _Maker:
     """Makes one actuator safe as often as it is demanded, and until it confirms.
 
@@ -44,6 +55,7 @@ class _Maker:
     def __init__(self, actuator: Harmful, pause_s: float, clock: Clock, changed: Callable[[], None]) -> None:
         self.failure = ""  # why the last try did not confirm
         self.demanded = self.begun = self.tried = self.confirmed = 0
+        self._since_ns = 0  # when the first demand was made that is not confirmed
         self._actuator = actuator
         self._pause_s = pause_s
         self._clock = clock
@@ -55,10 +67,17 @@ class _Maker:
         """Begin at once, also when the last try has just failed; one that has not begun yet serves two demands."""
         if self.demanded > self.begun:
             return
+        if self.confirmed == self.demanded:
+            self._since_ns = self._clock.now_ns()
         self.demanded += 1
         self._demand.set()
         if self._task is None or self._task.done() or self._task.cancelling():
             self._task = asyncio.create_task(self._until_confirmed())
+
+    def pending(self) -> Pending | None:
+        """None when what was demanded is confirmed."""
+        is_confirmed = self.confirmed == self.demanded
+        return None if is_confirmed else Pending(self._actuator.name, self._since_ns, self.failure)
 
     def forgive(self) -> None:
         """An operator has taken over: what is not confirmed yet is tried no more."""
@@ -125,6 +144,11 @@ class Safety:
     def unconfirmed(self) -> tuple[str, ...]:
         """What has been tried and not confirmed, a sentence each."""
         return tuple(maker.failure for maker in self._makers if maker.failure)
+
+    @property
+    def pending(self) -> tuple[Pending, ...]:
+        """What has not confirmed its safe state, be it tried or not."""
+        return tuple(pending for maker in self._makers if (pending := maker.pending()) is not None)
 
     @property
     def is_confirmed(self) -> bool:

@@ -86,6 +86,11 @@ class Permits:
         """Whether heat may be given now: permitted, and the guard finds all well."""
         return self.granted and self.allowed()
 
+    @property
+    def timer_s(self) -> float | None:
+        """So long after the last renewal the board itself switches heat and cold off; None without a board."""
+        return self._limits.hold_s if self._relays.has_timer else None
+
     def grant(self) -> None:
         """Permit heat and cold; `arm` switches."""
         self.permission, self.intrusions = Permission.GRANTED, 0

@@ -24,7 +24,7 @@ from stand.commands.sessions.session_text import size
 from stand.gate import INTERLOCK, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import RunStatus, StandState
-from stand.watching.moment import SET_POINT, heat_by_hand
+from stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
 from stand.watching.remedies import for_reason, next_command
 
 app = App()
@@ -170,7 +170,8 @@ def _show(server: Server, state: StandState) -> None:
     run = {} if state.run is None else state.run.model_dump(mode="json")
     data = {**run, "session": run.get("session") or server.name, "stand": state.model_dump(mode="json")}
     lines = idle_lines(server.name, state) if state.run is None else status_lines(str(data["session"]), state.run)
-    lines = [*lines, *(_row("next", text) for text in _next(state))]
+    unsafe = (_row("not safe yet", text) for text in not_yet_safe(state))
+    lines = [*unsafe, *lines, *(_row("next", text) for text in _next(state))]
     asked = [] if state.prompt is None else [_row("asks", f"{state.prompt.text}; `stand continue` when it is done")]
     show(data, [*lines, *asked])
 

@@ -17,6 +17,7 @@ from foundation.documents import Document
 from foundation.errors import StandError
 from foundation.readings import Cause, Quality
 from recording.reading.notes import LONGEST_NOTE
+from stand.serving.not_confirmed import NotConfirmed
 from stand.serving.plan_faults import PlanCheck
 
 # Verbs of a command's event, in the words of the interface.
@@ -185,12 +186,12 @@ class StandState(Value):
     """The whole stand at one instant, as the control loop published it.
 
     seq: the sequence number of the stream that this state is after. version: of the program. phase: idle between runs.
-    by_hand: heat that somebody ordered then. reasons: what holds the run. readings: the last of every channel.
-    setpoint_degC: of the chamber, None when it is stopped or unknown. output_percent: of the regulator. flap: "open",
-    "closed", "moving", or "" when it is not known. axes: positions, mm or deg. counters: what wears, by name
-    (compressor_hours, relay_cycles, ...). moving: what is under way, as in `linear to 250 mm`. busy: the devices that
-    carry out an order. drops: items that the interface was too slow for. pausing: a pause comes when the step under way
-    is done.
+    by_hand: heat that somebody ordered then. not_confirmed: what has not confirmed its safe state since a stop, a trip
+    or the end of a run. reasons: what holds the run. readings: the last of every channel. setpoint_degC: of the
+    chamber, None when it is stopped or unknown. output_percent: of the regulator. flap: "open", "closed", "moving", or
+    "" when it is not known. axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles,
+    ...). moving: what is under way, as in `linear to 250 mm`. busy: the devices that carry out an order. drops: items
+    that the interface was too slow for. pausing: a pause comes when the step under way is done.
     """
 
     seq: int = 0
@@ -205,6 +206,7 @@ class StandState(Value):
     fault: FaultState | None = None
     prompt: PromptState | None = None
     by_hand: HeatByHand | None = None
+    not_confirmed: tuple[NotConfirmed, ...] = ()
     readings: dict[str, ReadingState] = Field(default_factory=dict)
     setpoint_degC: float | None = None
     output_percent: float | None = None

@@ -10,6 +10,7 @@ from foundation.hub import Hub
 from foundation.readings import Quality, Reading
 from stand.config.stand_config import StandConfig
 from stand.serving.desk import ReadingState, StandState
+from stand.serving.not_confirmed import NotConfirmed
 from stand.stand import Stand
 
 
@@ -26,6 +27,7 @@ def seen_state(config: StandConfig, stand: Stand, hub: Hub, clock: Clock) -> Sta
         utc_offset_ns=utc_offset_ns(clock),
         phase="idle",
         reasons=tuple(sorted(stand.gate.reasons)),
+        not_confirmed=_not_confirmed(stand),
         readings={channel: _reading(reading) for channel, reading in readings.items()},
         setpoint_degC=_value(readings.get("regulator.sp")) if _value(readings.get("regulator.running")) else None,
         output_percent=output_percent,
@@ -36,6 +38,19 @@ def seen_state(config: StandConfig, stand: Stand, hub: Hub, clock: Clock) -> Sta
         axes={name: _value(readings.get(f"{name}.position")) for name in stand.devices.axes},
         moving=tuple(stand.motions.texts),
         busy=stand.motions.names,
+    )
+
+
+def _not_confirmed(stand: Stand) -> tuple[NotConfirmed, ...]:
+    permits = stand.chamber.permits
+    return tuple(
+        NotConfirmed(
+            name=each.name,
+            since_ns=each.since_ns,
+            reason=each.failure,
+            timer_s=permits.timer_s if each.name == permits.name else None,
+        )
+        for each in stand.safety.pending
     )
 
 

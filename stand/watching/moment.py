@@ -90,6 +90,16 @@ def heat_by_hand(state: StandState) -> str:
     return f"heated by hand to {state.by_hand.setpoint_degC:g} °C since {since}"
 
 
+def not_yet_safe(state: StandState) -> Iterable[str]:
+    """A sentence for each part that has not confirmed its safe state."""
+    for part in state.not_confirmed:
+        since = local_text(part.since_ns + state.utc_offset_ns)
+        found = f"{part.reason}; it is tried until it does" if part.reason else f"{part.name} is being made safe"
+        yield f"since {since}: {found}"
+        if part.reason and part.timer_s is not None:
+            yield f"heat and cold: the relay board's own timer ends them, {part.timer_s:g} s after that"
+
+
 def _value(state: StandState, channel: str) -> float | None:
     return state.readings[channel].value if channel in state.readings else None
 

@@ -42,6 +42,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
+from stand.serving.not_confirmed import NotConfirmed
 from stand.serving.plan_faults import PlanCheck
 
 STAND = "a stand"
@@ -62,6 +63,7 @@ class ADesk:
             self.gate.hold(reason)
         self.run = run
         self.by_hand: HeatByHand | None = None
+        self.not_confirmed: tuple[NotConfirmed, ...] = ()
         self.moving: tuple[str, ...] = ()
         self.orders: list[tuple[Who, Verb, dict[str, JsonValue]]] = []
         self.queue: list[QueuedRun] = []
@@ -92,6 +94,7 @@ class ADesk:
             run=self.run,
             reasons=tuple(sorted(self.gate.reasons)),
             by_hand=self.by_hand,
+            not_confirmed=self.not_confirmed,
             readings={
                 name: ReadingState(
                     value=None if each.quality == "bad" else each.value,

@@ -22,6 +22,7 @@ from stand.running.opening.stop import Stop
 from stand.running.status import StatusBoard
 from stand.serving.api.access import user_name
 from stand.serving.desk import RunStatus
+from stand.serving.not_confirmed import NotConfirmed
 from tests.asking import ask
 from tests.host import Host
 from tests.stand.a_desk import ADesk, served
@@ -76,6 +77,20 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
         "next          `stand continue` ends the pause",
     ]
     assert RunStatus.model_validate(reported) == STATUS.model_copy(update={"session": str(path)})
+
+
+@pytest.mark.parametrize("run", [STATUS, None])
+async def test_status_begins_with_what_is_not_confirmed_safe(tmp_path: Path, run: RunStatus | None):
+    path, failure = session(tmp_path, "night"), "relays did not confirm its safe state: relays: no answer"
+    async with served(ADesk(run=run), path) as desk:
+        desk.not_confirmed = (NotConfirmed(name="relays", since_ns=STATUS.since_ns, reason=failure, timer_s=15.0),)
+        lines = (await invoke("status", path)).stdout.splitlines()
+        desk.not_confirmed = ()
+        assert "not safe" not in (await invoke("status", path)).stdout
+    assert lines[:2] == [
+        f"not safe yet  since 2026-01-01 17:59:00 UTC: {failure}; it is tried until it does",
+        "not safe yet  heat and cold: the relay board's own timer ends them, 15 s after that",
+    ]
 
 
 def test_status_tells_utc_when_the_system_clock_was_stepped_after_the_present_state_began():

@@ -10,6 +10,7 @@ from foundation.clock import NS_PER_S
 from foundation.items import Batch
 from foundation.readings import Reading
 from stand.serving.desk import HeatByHand
+from stand.serving.not_confirmed import NotConfirmed
 from tests.recording.recorded import record
 from tests.stand.browser import PHONE, VIEWS, a_page, needs_chromium
 from tests.stand.page_desk import a_night, frame_of, free_port, target_image
@@ -60,6 +61,26 @@ async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_an
             assert await page.evaluate(WHOLE_HEADER)
         night.by_hand = None
         await page.get_by_text("Idle", exact=True).wait_for()
+
+
+async def test_what_is_not_confirmed_safe_is_seen_until_it_is(night):
+    """Under a fault, which does not say that the stand is safe meanwhile."""
+    night.trip()
+    since_ns, failure = night.clock.now_ns(), "relays did not confirm its safe state: relays: no answer"
+    waiting = NotConfirmed(name="relays", since_ns=since_ns, timer_s=15.0)
+    night.not_confirmed = (waiting, NotConfirmed(name="flap", since_ns=since_ns))
+    async with a_page(night.chromium, night.port, size=PHONE) as page:
+        await page.get_by_role("heading", name="Being made safe: relays, flap", exact=True).wait_for()
+        fault = page.locator(".notice", has_text="Tripped: ")
+        await fault.get_by_text("That the stand is safe is not yet confirmed.").wait_for()
+        night.not_confirmed = (waiting.model_copy(update={"reason": failure}),)
+        alert = page.locator(".notice.error", has_text="Not yet confirmed safe: relays")
+        await alert.get_by_text(failure).wait_for()
+        first = await page.locator("#notices .notice").first.inner_text()
+        assert "the relay board's own timer ends them, 15 s after that" in first
+        night.not_confirmed = ()
+        await alert.wait_for(state="detached")
+        await fault.get_by_text("The stand is made safe.").wait_for()
 
 
 async def test_event_marks_and_the_night_are_there_after_a_reload(night):

@@ -8,7 +8,7 @@ from foundation.clock import VirtualClock, seconds_ns
 from foundation.errors import DeviceFault, Unreachable
 from foundation.hub import Hub
 from foundation.items import Event
-from stand.safety import Safety
+from stand.safety import Pending, Safety
 
 
 class Actuator:
@@ -86,6 +86,28 @@ async def test_a_link_that_is_gone_is_tried_until_it_is_back_and_each_minute_is_
         assert bench.clock.now_ns() < seconds_ns(153.0)
         assert bench.kinds()[-1] == "confirmed_safe"
         assert bench.safety.unconfirmed == ()
+
+
+async def test_what_is_not_confirmed_is_known_with_since_when_until_it_is():
+    async with running() as bench:
+        bench.relays.failure = Unreachable("relays", "no answer")
+        bench.flap.takes_s = 5.0
+        await bench.wait(1.0)
+        assert bench.safety.pending == ()
+        bench.safety.demand()
+        assert bench.safety.pending == tuple(Pending(name, seconds_ns(1.0), "") for name in ("relays", "flap"))
+        await bench.wait(3.0)
+        bench.safety.demand()  # once more: it is not safe since the first time
+        (relays, flap), failure = bench.safety.pending, "relays did not confirm its safe state: relays: no answer"
+        assert relays == Pending("relays", seconds_ns(1.0), failure)
+        assert flap.failure == ""
+        await bench.wait(8.0)
+        assert bench.safety.pending == (relays,)
+        bench.relays.failure = None
+        await bench.wait(3.0)
+        assert bench.safety.pending == ()
+        bench.safety.demand()
+        assert bench.safety.pending[0] == Pending("relays", bench.clock.now_ns(), "")
 
 
 async def test_the_wait_ends_after_its_limit_and_says_what_is_not_safe():

@@ -13,6 +13,7 @@ const ENDS = {
   disk_low: "It goes on when there is room: stand session archive copies what is finished elsewhere.",
   not_recorded: "It goes on when the disk takes what waits: see that it is there, has room and answers.",
 };
+const FIRST = ["unsafe", "lost"]; // all else is of before while the connection is lost
 export const reason = (name) => REASON[name] ?? words(name);
 
 export class Notices {
@@ -31,12 +32,14 @@ export class Notices {
     if (!key) return null;
     const made = { key, ...make() };
     this.parts[kind] = made;
-    kind === "lost" ? this.place.prepend(made.element) : this.place.append(made.element); // all else is then of before
+    FIRST.includes(kind) ? this.place.prepend(made.element) : this.place.append(made.element);
     return made;
   }
 
   update(state) {
-    const { fault, prompt } = state;
+    const { fault, prompt, not_confirmed } = state;
+    const is_failing = not_confirmed.some(({ reason }) => reason);
+    this.set("unsafe", not_confirmed.length && `${is_failing} ${not_confirmed.map(({ name }) => name)}`, () => this.unsafe(state, is_failing))?.refresh(state);
     const tripped = this.set("fault", fault && `${fault.rule} ${fault.since_ns}`, () => this.fault(state));
     tripped?.refresh(state);
     this.set("prompt", prompt && `${prompt.step_id} ${prompt.text}`, () => this.prompt(prompt));
@@ -47,6 +50,15 @@ export class Notices {
 
   lost(text) {
     this.set("lost", text, () => ({ element: h("section", { class: "notice error", role: "alert" }, h("h2", {}, "No connection to the stand"), h("p", {}, text)) }));
+  }
+
+  // What was to be made safe and has not confirmed it: each try may find another reason.
+  unsafe({ not_confirmed }, is_failing) {
+    const names = not_confirmed.map(({ name }) => words(name)).join(", ");
+    const parts = not_confirmed.map(() => h("p", {}));
+    const element = h("section", { class: `notice ${is_failing ? "error" : "warning"}`, role: "alert" },
+      h("h2", {}, is_failing ? `Not yet confirmed safe: ${names}` : `Being made safe: ${names}`), parts);
+    return { element, refresh: (now) => parts.forEach((part, index) => say(part, not_yet(now.not_confirmed[index], now))) };
   }
 
   fault(state) {
@@ -63,9 +75,14 @@ export class Notices {
     fill(review, h("div", { class: "row" }, h("div", { class: "grow" }, h("h3", {}, "What tripped"),
       h("dl", { class: "facts" }, [["rule", words(fault.rule)], ["found", fault.text], ["at", clock(seconds(fault.since_ns, state.utc_offset_ns), true)], ...data.map(([name, value]) => [words(name), String(value)])].map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]))),
       h("div", { class: "grow" }, h("h3", {}, "Readings now"), readings)), h("div", { class: "row" }, clear));
+    const since = h("p", {});
     const element = h("section", { class: "notice error", role: "alert" }, h("h2", {}, `Tripped: ${words(fault.rule)}`), h("p", {}, fault.text),
-      h("p", {}, `Since ${day_clock(seconds(fault.since_ns, state.utc_offset_ns))}. The stand is made safe.`), h("div", { class: "row" }, open), review, answer);
-    return { element, refresh: (now) => this.readings(readings, now) };
+      since, h("div", { class: "row" }, open), review, answer);
+    return { element, refresh: (now) => {
+      const safe = now.not_confirmed.length ? "That the stand is safe is not yet confirmed." : "The stand is made safe.";
+      say(since, `Since ${day_clock(seconds(fault.since_ns, now.utc_offset_ns))}. ${safe}`);
+      this.readings(readings, now);
+    } };
   }
 
   readings(place, state) {
@@ -97,6 +114,13 @@ export class Notices {
     return { element: h("section", { class: "notice warning" }, h("h2", {}, `The run is held: ${state.reasons.map(reason).join("; ")}`),
       h("p", {}, [...state.reasons.map((name) => ENDS[name]), chamber].filter(Boolean).join(" ")), is_mine ? h("div", { class: "row" }, button) : null, answer) };
   }
+}
+
+function not_yet({ name, since_ns, reason, timer_s }, { utc_offset_ns }) {
+  const since = `Since ${clock(seconds(since_ns, utc_offset_ns), true)}`;
+  if (!reason) return `${since}: ${words(name)} is being made safe.`;
+  const timer = timer_s === null ? "" : ` Heat and cold cannot be switched off through it now: the relay board's own timer ends them, ${timer_s} s after that.`;
+  return `${since}: ${reason}. It is tried until it does.${timer}`;
 }
 
 const of = (reading) => (reading.value === null ? `no reading: ${reading.reason}` : `${number(reading.value, 2)} ${unit_of(reading.unit)}`);

@@ -1,0 +1,47 @@
+"""What the state of a stand says while nothing is run, and what `stand status` makes of it."""
+
+from typing import Any, cast
+
+from drivers.devices.absent_devices import NoRelays
+from foundation.clock import VirtualClock, seconds_ns
+from foundation.errors import Unreachable
+from foundation.instants import local_text
+from stand.config.stand_config import load_config, packaged
+from stand.serving.not_confirmed import NotConfirmed
+from stand.serving.seen import seen_state
+from stand.watching.moment import not_yet_safe
+from tests.stand.room_devices import Rooms, rooms
+
+BEGIN = f"since {local_text(0)}"
+
+
+def seen(here: Rooms):
+    return seen_state(load_config(packaged("", "simulated")), here.stand, here.hub, here.clock)
+
+
+async def test_after_a_stop_while_a_wire_is_gone_it_is_told_what_is_not_confirmed_until_it_is():
+    async with rooms() as here:
+        for part in (here.relays, here.regulator, here.flap):
+            here.stand.opened(cast("Any", part))
+        here.relays.failures = [Unreachable("relays", "no answer") for _ in range(4)]  # two tries of two calls
+        assert seen(here).not_confirmed == ()
+        here.stand.safety.demand()
+        first = [NotConfirmed(name=name, since_ns=0) for name in ("relays", "regulator", "flap")]
+        assert seen(here).not_confirmed == (first[0].model_copy(update={"timer_s": 15.0}), *first[1:])
+        assert f"{BEGIN}: flap is being made safe" in not_yet_safe(seen(here))
+        await here.passes(2.5)
+        failure = "relays did not confirm its safe state: relays: no answer"
+        assert seen(here).not_confirmed == (NotConfirmed(name="relays", since_ns=0, reason=failure, timer_s=15.0),)
+        assert list(not_yet_safe(seen(here))) == [
+            f"{BEGIN}: {failure}; it is tried until it does",
+            "heat and cold: the relay board's own timer ends them, 15 s after that",
+        ]
+        await here.passes(6.0)
+        assert seen(here).not_confirmed == ()
+        assert list(not_yet_safe(seen(here))) == []
+
+
+def test_a_stand_without_a_relay_board_has_no_timer_that_ends_heat():
+    here = Rooms()
+    here.stand.chamber.permits._relays = NoRelays("relays", VirtualClock(seconds_ns(0)))
+    assert here.stand.chamber.permits.timer_s is None
