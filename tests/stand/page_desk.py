@@ -64,6 +64,7 @@ class NightDesk(ADesk):
         self.fault: FaultState | None = None
         self.prompt: PromptState | None = None
         self.is_idle = False
+        self.is_heat_permitted = True
         self.lost = ""  # a device that does not answer
         self.stops = 0
         self.viewing: Viewing | None = None
@@ -114,9 +115,9 @@ class NightDesk(ADesk):
                 "reasons": reasons,
                 "fault": self.fault,
                 "prompt": self.prompt,
-                "setpoint_degC": values.get("regulator.sp", set_point_degC(self.now_s())),
+                "setpoint_degC": None if self.lost == "regulator" else set_point_degC(self.now_s()),
                 "output_percent": values.get("regulator.mv_heat"),
-                "heater_permitted": not self.fault,
+                "heater_permitted": self.is_heat_permitted and not self.fault,
                 "compressor_on": bool(values.get("relays.compressor")),
                 "camera_on": True,
                 "flap": "closed",

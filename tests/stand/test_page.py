@@ -9,6 +9,7 @@ from axe_playwright_python.base import AXE_SCRIPT
 from foundation.clock import NS_PER_S
 from foundation.items import Batch
 from foundation.readings import Reading
+from stand.gate import CAMERA_LOST
 from stand.serving.desk import HeatByHand
 from stand.serving.not_confirmed import NotConfirmed
 from tests.recording.recorded import record
@@ -61,6 +62,20 @@ async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_an
             assert await page.evaluate(WHOLE_HEADER)
         night.by_hand = None
         await page.get_by_text("Idle", exact=True).wait_for()
+
+
+async def test_a_held_run_whose_set_point_is_not_read_is_not_said_to_be_stopped(night):
+    night.gate.hold(CAMERA_LOST)
+    async with a_page(night.chromium, night.port) as page:
+        held = page.locator(".notice", has_text="The run is held: a camera does not answer")
+        await held.get_by_text("The chamber keeps its set-point.").wait_for()
+        night.lost = "regulator"
+        await held.get_by_text("Heat and cold are permitted; the regulator's set-point is not known now.").wait_for()
+        now_ns = night.clock.now_ns()
+        night.hub.publish(Batch("regulator", now_ns, (Reading("regulator.running", 0.0, "1", now_ns),)))
+        await held.get_by_text("The regulator is stopped.").wait_for()
+        night.is_heat_permitted = False
+        await held.get_by_text("Heat and cold are not permitted.").wait_for()
 
 
 async def test_what_is_not_confirmed_safe_is_seen_until_it_is(night):

@@ -44,7 +44,7 @@ export class Notices {
     tripped?.refresh(state);
     this.set("prompt", prompt && `${prompt.step_id} ${prompt.text}`, () => this.prompt(prompt));
     const held = state.run && !fault && !prompt && state.reasons.length ? state.reasons.join() : "";
-    this.set("held", held, () => this.held(state));
+    this.set("held", held, () => this.held(state))?.refresh(state);
     this.set("queue", !state.run && state.queue_halted, () => this.halted(state));
   }
 
@@ -110,10 +110,19 @@ export class Notices {
     const answer = h("p", { class: "answer", role: "status" });
     const is_mine = state.reasons.includes("operator");
     const button = h("button", { type: "button", class: "main", onclick: () => command(answer, "continue", "POST", "/run/continue") }, "Continue");
-    const chamber = state.setpoint_degC === null ? "The chamber is stopped." : "The chamber keeps its set-point.";
-    return { element: h("section", { class: "notice warning" }, h("h2", {}, `The run is held: ${state.reasons.map(reason).join("; ")}`),
-      h("p", {}, [...state.reasons.map((name) => ENDS[name]), chamber].filter(Boolean).join(" ")), is_mine ? h("div", { class: "row" }, button) : null, answer) };
+    const text = h("p", {});
+    const element = h("section", { class: "notice warning" }, h("h2", {}, `The run is held: ${state.reasons.map(reason).join("; ")}`),
+      text, is_mine ? h("div", { class: "row" }, button) : null, answer);
+    return { element, refresh: (now) => say(text, [...now.reasons.map((name) => ENDS[name]), chamber_of(now)].filter(Boolean).join(" ")) };
   }
+}
+
+// What is known of the chamber: a set-point that is not read is not one that is not held.
+function chamber_of({ heater_permitted, setpoint_degC, readings }) {
+  if (!heater_permitted) return "Heat and cold are not permitted.";
+  if (setpoint_degC !== null) return "The chamber keeps its set-point.";
+  if (readings["regulator.running"]?.value === 0) return "The regulator is stopped.";
+  return "Heat and cold are permitted; the regulator's set-point is not known now.";
 }
 
 function not_yet({ name, since_ns, reason, timer_s }, { utc_offset_ns }) {
