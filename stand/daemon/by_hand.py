@@ -39,6 +39,12 @@ class ByHand:
         self._heat = heat
         self._kinds = device_kinds(assembly.config)
 
+    @property
+    def doing(self) -> str:
+        """What is done between runs, in a few words."""
+        ordered = self._stand.chamber.ordered
+        return "idle" if ordered is None else f"heat by hand, set-point {ordered.setpoint_degC:g} degC"
+
     def devices(self, refused: str) -> tuple[DeviceState, ...]:
         """What there is; refused: why nothing is taken now."""
         readings = self._assembly.hub.readings

@@ -64,6 +64,7 @@ class Daemon:
         self._hub = hub
         self._clock = assembly.clock
         self._kept, self._keep = kept, keep
+        self._status = systemd.Status()
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
         self._is_given_up = False  # an operator does not want to wait for the confirmation that the stand is safe
         self._hands: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
@@ -133,11 +134,10 @@ class Daemon:
 
     async def do_by_hand(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
         """What came of it within a moment, as a sentence; Conflict when that is nothing good, or it is refused."""
-        work = self.by_hand.work
         if refused := self.refused_by_hand():
             raise Conflict(refused)
         what = f"{name} {verb}"
-        hand = asyncio.ensure_future(work(name, verb, arguments))
+        hand = asyncio.ensure_future(self.by_hand.work(name, verb, arguments))
         self._hands[hand] = name
         hand.add_done_callback(self._hands.pop)
         done, _ = await asyncio.wait([hand], timeout=_BY_HAND_S)
@@ -241,7 +241,7 @@ class Daemon:
             self._beside(self._hand_over())
 
         self.has_guest = True
-        systemd.tell(f"STATUS=run {entry.id} ({entry.recipe})")
+        self._status.tell(f"run {entry.id} ({entry.recipe})")
         try:
             await cancelled(list(self._hands))
             await self.orders.read()
@@ -257,7 +257,7 @@ class Daemon:
                 await self._record_day()
             self.has_guest = False
             self.note()
-            systemd.tell("STATUS=idle")
+            self._status.tell(self.by_hand.doing)
 
     async def _record_day(self) -> None:
         """Heat depends on the record between runs while no run records; a disk that refuses it is an event, and
@@ -285,7 +285,7 @@ class Daemon:
             self._tell("warning", "house_not_recorded", str(error))
 
     async def _look_after(self) -> None:
-        """Midnight, a record that has ended by itself, and what is kept for the next start."""
+        """Midnight, a record that has ended by itself, what is kept for the next start, and what systemd shows."""
         kept_ns = read_ns = self._clock.now_ns()
         reading: asyncio.Future[None] | None = None
         while True:
@@ -295,6 +295,8 @@ class Daemon:
                 if reading is None or reading.done():  # another program may have locked it
                     reading = self._beside(self._read_queue())
             may_begin = not (self.has_guest or self.orders.leaving)
+            if may_begin:
+                self._status.tell(self.by_hand.doing)
             if may_begin and self.open_stand.disk is not None and (ended := self.open_stand.disk.ended):
                 raise SessionError(f"{ended}; neither queue nor what the compressor did can be kept without it")
             if may_begin and self._is_midnight():

@@ -20,6 +20,19 @@ def tell(*lines: str) -> None:
         manager.sendto("\n".join(lines).encode(), f"\0{address[1:]}" if address.startswith("@") else address)
 
 
+class Status:
+    """What is done now, told when it changes."""
+
+    def __init__(self) -> None:
+        self._told = ""
+
+    def tell(self, text: str) -> None:
+        """In a few words, as `systemctl status` shows them."""
+        if text != self._told:
+            self._told = text
+            tell(f"STATUS={text}")
+
+
 def watchdog_s() -> float | None:
     """How often it wants to be fed at the least, None when it does not."""
     with suppress(ValueError):

@@ -99,6 +99,15 @@ def test_the_service_manager_is_notified_in_lines(manager: socket.socket, monkey
     assert systemd.watchdog_s() is None
 
 
+def test_what_is_done_is_told_to_the_service_manager_when_it_changes(manager: socket.socket):
+    status = systemd.Status()
+    for text in ("idle", "idle", "heat by hand", "idle"):
+        status.tell(text)
+    assert [manager.recv(1000) for _ in range(3)] == [b"STATUS=idle", b"STATUS=heat by hand", b"STATUS=idle"]
+    with pytest.raises(BlockingIOError):
+        manager.recv(1000)
+
+
 def test_without_a_service_manager_nobody_is_notified(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)

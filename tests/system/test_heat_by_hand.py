@@ -1,8 +1,9 @@
 """Heat that an operator orders between runs: it goes on over midnight, and is told while the regulator is not read."""
 
 import asyncio
+import socket
 from collections.abc import AsyncGenerator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,16 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
     day = ["20261122"]
     monkeypatch.setattr(DayRecord, "_today", lambda _: day[0])
     reported: list[Event] = []
+    told: list[bytes] = []  # to the service manager
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    manager.bind(str(tmp_path / "notify"))
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+
+    def is_told(line: bytes) -> bool:
+        with suppress(BlockingIOError):
+            while True:
+                told.extend(manager.recv(1000).splitlines())
+        return told[-1:] == [line]
 
     @asynccontextmanager
     async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
@@ -55,13 +66,17 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
             await until(lambda: desk.state().setpoint_degC == 40.0)
             assert desk.state().by_hand == by_hand is not None
             assert daemon.open_stand.recorder is daemon.record.recorder
+            await until(lambda: is_told(b"STATUS=heat by hand, set-point 40 degC"))
+            desk.stop(who)
+            await until(lambda: is_told(b"STATUS=idle"))
 
         working = asyncio.create_task(work())
         working.add_done_callback(lambda _: daemon.leave())
         yield
         await working
 
-    await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
+    with manager:
+        await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
     # On a busy machine a poll may take longer than its period.
     assert {event.kind for event in reported if event.level != "info"} <= {"device_slow"}
     first, second = (
