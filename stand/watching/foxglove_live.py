@@ -62,6 +62,7 @@ class Published:
                 self._channel(device, values).log(values, log_time=time_ns + state.utc_offset_ns)
         words = {name: getattr(state, name) for name in _STATE}
         words |= {"held_by": ", ".join(state.reasons), "fault": "" if state.fault is None else state.fault.text}
+        words["by_hand_setpoint_degC"] = None if state.by_hand is None else state.by_hand.setpoint_degC
         words |= {} if state.run is None else {"doing": state.run.doing, "frames_saved": state.run.frames_saved}
         self._state.log(words, log_time=state.now_ns + state.utc_offset_ns)
 

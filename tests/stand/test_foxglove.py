@@ -11,7 +11,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from foundation.readings import Quality
-from stand.serving.desk import ReadingState, StandState
+from stand.serving.desk import HeatByHand, ReadingState, StandState
 from tests.addresses import free_port
 
 live = pytest.importorskip("stand.watching.foxglove_live")
@@ -84,7 +84,8 @@ async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot
             await viewer.send(json.dumps({"op": "subscribe", "subscriptions": asks}))
             while not published._camera.has_sinks():
                 await asyncio.sleep(0.01)
-            published.state(state(25.5, NOW_NS + 1))
+            by_hand = HeatByHand(setpoint_degC=40.0, since_ns=NOW_NS)
+            published.state(state(25.5, NOW_NS + 1).model_copy(update={"by_hand": by_hand}))
             event = {
                 "time_ns": NOW_NS,
                 "utc_offset_ns": UTC_NS,
@@ -103,7 +104,8 @@ async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot
         published.close()
     time_ns, content = got[numbers["/readings/thermometers"]]
     assert (time_ns, json.loads(content)) == (NOW_NS + 1 + UTC_NS, {"air": 25.5, "granite": None})
-    assert json.loads(got[numbers["/state"]][1])["setpoint_degC"] == 30.0
+    told = json.loads(got[numbers["/state"]][1])
+    assert (told["setpoint_degC"], told["by_hand_setpoint_degC"]) == (30.0, 40.0)
     assert b"too warm" in got[numbers["/events"]][1]
     assert got[numbers["/camera"]][0] == NOW_NS + UTC_NS
     assert b"a picture" in got[numbers["/camera"]][1]

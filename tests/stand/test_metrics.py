@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stand.serving.api.bridge import Bridge, Snapshot
 from stand.serving.api.metrics import metrics
-from stand.serving.desk import FaultState, QueuedRun
+from stand.serving.desk import FaultState, HeatByHand, QueuedRun
 from tests.stand.a_desk import ADesk
 from tests.stand.test_interface import STATUS
 
@@ -22,6 +22,7 @@ async def page() -> str:
             "stand": 'a "stand"\nof \\ours',
             "fault": FaultState(rule="over_temperature", text="too hot", since_ns=1),
             "setpoint_degC": 30.0,
+            "by_hand": HeatByHand(setpoint_degC=40.0, since_ns=bridge.snapshot.state.now_ns - 60_000_000_000),
             "output_percent": -12.5,
             "counters": {"compressor_hours": 12.5},
             "queue": (QueuedRun(id=1, recipe="r", state="waiting", added_ns=1),),
@@ -46,6 +47,8 @@ async def test_every_line_is_of_the_format_and_no_measurement_is_invented():
     assert values['thermostand_phase{phase="held"}'] == 1
     assert values['thermostand_hold{reason="operator"}'] == 1
     assert values["thermostand_left_seconds"] == 60
+    assert values["thermostand_by_hand_setpoint_celsius"] == 40
+    assert values["thermostand_by_hand_seconds"] == 60
     assert values["thermostand_output_percent"] == -12.5
     assert values["thermostand_interface_drops_total"] == 3
     assert r'stand="a \"stand\"\nof \\ours"' in text

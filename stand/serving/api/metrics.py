@@ -46,6 +46,10 @@ def _of_state(state: StandState) -> Iterator[_Metric]:
     yield "fault", "gauge", "1 for the rule that has tripped.", fault
     if state.setpoint_degC is not None:
         yield "setpoint_celsius", "gauge", "Set-point of the chamber.", [({}, state.setpoint_degC)]
+    if (hand := state.by_hand) is not None:
+        yield "by_hand_setpoint_celsius", "gauge", "Set-point of heat by hand, as ordered.", [({}, hand.setpoint_degC)]
+        since = [({}, (state.now_ns - hand.since_ns) / 1e9)]
+        yield "by_hand_seconds", "gauge", "Since heat by hand was permitted.", since
     if state.output_percent is not None:
         yield "output_percent", "gauge", "Output of the regulator.", [({}, state.output_percent)]
     yield "heater_permitted", "gauge", "1 while heat is permitted.", [({}, float(state.heater_permitted))]
