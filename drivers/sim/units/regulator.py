@@ -24,16 +24,9 @@ from drivers.sim.units.modbus import (
     writes_one,
     writes_words,
 )
-from drivers.sim.units.pid import OFF, Gains, Outputs, PidState, Side, on_time_ns, resume, start, step
+from drivers.sim.units.pid import OFF, Outputs, PidState, on_time_ns, resume, start, step
 from drivers.sim.units.regulator_table import (
-    COOL_BAND,
-    COOL_DERIVATIVE,
-    COOL_INTEGRAL,
     COOL_PERIOD,
-    DEAD_BAND,
-    HEAT_BAND,
-    HEAT_DERIVATIVE,
-    HEAT_INTEGRAL,
     HEAT_PERIOD,
     INPUT_SHIFT,
     MV_AT_ERROR,
@@ -45,6 +38,7 @@ from drivers.sim.units.regulator_table import (
     SETPOINT,
     TUNED,
     Writable,
+    gains_of,
     stored_at,
     to_value,
     to_word,
@@ -201,7 +195,7 @@ class FakeRegulator:
             low, high = self.setpoint_clamp_degC
             value = min(high, max(low, value))
         self._ram[address] = value
-        self._gains = self._tuning()
+        self._gains = gains_of(self._ram)
         if keep:
             self._eeprom[address] = value
             self.eeprom_writes += 1
@@ -273,7 +267,7 @@ class FakeRegulator:
 
     def _power_up(self) -> None:
         self._ram = dict(self._eeprom)
-        self._gains = self._tuning()
+        self._gains = gains_of(self._ram)
         self._modes = {Mode.STOP}
         self._pid: PidState | None = None
         self.outputs = OFF
@@ -381,14 +375,6 @@ class FakeRegulator:
     def _shown_degC(self) -> float:
         low_degC, high_degC = PT100_RANGE_DEGC
         return high_degC if self.sensor_break else min(high_degC, max(low_degC, self._pv_degC()))
-
-    def _tuning(self) -> Gains:
-        ram = self._ram
-        return Gains(
-            heat=Side(ram[HEAT_BAND], ram[HEAT_INTEGRAL], ram[HEAT_DERIVATIVE], ram[MV_UPPER]),
-            cool=Side(ram[COOL_BAND], ram[COOL_INTEGRAL], ram[COOL_DERIVATIVE], -ram[MV_LOWER]),
-            dead_band_K=ram[DEAD_BAND],
-        )
 
     def _period_ns(self, address: int) -> int:
         coded = self._ram[address]

@@ -6,8 +6,11 @@ The proportional bands and times are not the factory's but those a commissioning
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+
+from drivers.sim.units.pid import Gains, Side
 
 PT100_RANGE_DEGC = (-199.9, 500.0)  # input type 1
 
@@ -75,6 +78,15 @@ PARAMETERS = {
     0x2E06: Parameter(1, 0, 10, 0, Writable.SETUP),  # output 1: heating
     0x2E07: Parameter(2, 0, 10, 0, Writable.SETUP),  # output 2: cooling
 }
+
+
+def gains_of(ram: Mapping[int, float]) -> Gains:
+    """The constants of the PID that these registers hold."""
+    return Gains(
+        heat=Side(ram[HEAT_BAND], ram[HEAT_INTEGRAL], ram[HEAT_DERIVATIVE], ram[MV_UPPER]),
+        cool=Side(ram[COOL_BAND], ram[COOL_INTEGRAL], ram[COOL_DERIVATIVE], -ram[MV_LOWER]),
+        dead_band_K=ram[DEAD_BAND],
+    )
 
 
 def stored_at(address: int) -> int:
