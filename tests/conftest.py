@@ -29,7 +29,12 @@ _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera
 # of a file that makes something once for all of them, or whose devices have the same serial numbers.
 _DEALT_OUT = PurePath("tests/system")
 # A worker that took these last would be the only one at work for a minute.
-_LONG_FILES = {f"tests/stand/test_page{part}.py" for part in ("", "_orders", "_room")}
+_LONG_FILES = {
+    "tests/drivers/test_climate_chamber_losses.py",
+    "tests/stand/test_page.py",
+    "tests/stand/test_page_orders.py",
+    "tests/stand/test_page_room.py",
+}
 _TOGETHER = {
     # Real devices belong to one program by their serial numbers, whatever their addresses.
     "tests/system/test_queue_wires.py",
