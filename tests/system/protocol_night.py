@@ -8,6 +8,7 @@ own, and prints an Outcome as JSON.
 from __future__ import annotations
 
 import asyncio
+import gc
 import hashlib
 import json
 import math
@@ -38,13 +39,14 @@ experiments:
       cycles: 2
 """
 GROWTH_LIMIT_MB = 5.0
+LOOK_EVERY_s = 1800.0
 SETTLED_s = 3600.0  # by then every frame buffer and every code path has been used
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """One run: real and simulated duration (s), the daemon's resident memory after an hour (NaN in a shorter run) and
-    at the end (MB), the digest of all bytes of the session."""
+    half an hour before the end at most (MB), the digest of all bytes of the session."""
 
     wall_s: float
     simulated_s: float
@@ -81,15 +83,18 @@ class _Watch:
     def __init__(self) -> None:
         self.first_ns = self.last_ns = 0
         self.settled_MB = self.last_MB = math.nan
+        self._looks = 0
 
     def follow(self, hub: Hub) -> None:
         """Look on from now on."""
         hub.subscribe(self._receive)
 
     def _receive(self, item: Item) -> None:
-        self.first_ns = self.first_ns or item.time_ns
-        if item.time_ns >= self.last_ns + 60 * NS_PER_S:
-            self.last_ns, self.last_MB = item.time_ns, _resident_MB()
+        self.first_ns, self.last_ns = self.first_ns or item.time_ns, item.time_ns
+        if item.time_ns - self.first_ns >= self._looks * LOOK_EVERY_s * NS_PER_S:
+            self._looks += 1
+            gc.collect()  # what is collected later, in a quiet moment, is not left in memory
+            self.last_MB = _resident_MB()
             if math.isnan(self.settled_MB) and self.last_ns - self.first_ns >= SETTLED_s * NS_PER_S:
                 self.settled_MB = self.last_MB
 
