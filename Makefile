@@ -14,7 +14,7 @@ WORKERS := $(shell workers=$$(($$(nproc) * 3)); echo $$((workers < 12 ? workers 
 # MB that pyright's new objects may take: its garbage is collected less often, which saves 4 % of its processor time.
 CHECKER_OPTIONS := --max-semi-space-size=128
 RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
-PEER_PACKAGES := aravis-tools-cli aravis-tools chromium-headless-shell gcc libc6-dev
+PEER_PACKAGES := aravis-tools-cli aravis-tools chromium-headless-shell/chromium gcc libc6-dev
 
 .PHONY: setup demo test nightly bench benchmark clean
 
