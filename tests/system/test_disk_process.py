@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import SessionError
+from recording.reading.gaps import FRAMES_DROPPED
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 from recording.writing import locks
@@ -93,11 +94,19 @@ def entries(directory):
 
 def check(directory, frames):
     """Everything acknowledged is in the session."""
-    salvage_session(directory)
-    session = Session.open(directory)
-    blocks = [frame.block_id for frame in session.frames()]
+    blocks, lost = recorded(directory)
     assert blocks == list(range(len(blocks)))
     assert len(blocks) >= frames
+    assert lost == set()
+
+
+def recorded(directory):
+    """The numbers of the frames that are in the session, and of those that it says were lost."""
+    salvage_session(directory)
+    session = Session.open(directory)
+    spans = [span for event in session.events() if event.kind == FRAMES_DROPPED for span in event.data["blocks"]]
+    lost = {block for first, last in spans for block in range(first, last + 1)}
+    return [frame.block_id for frame in session.frames()], lost
 
 
 def test_a_daemon_on_a_healthy_disk_ends_with_a_whole_session_and_leaves_nothing(tmp_path):
@@ -171,4 +180,7 @@ def test_a_folder_that_was_renamed_under_a_daemon_is_seen_within_a_commit(tmp_pa
         daemon.until(lambda more, messages, age_s, lost: more > frames)
         code, said, frames, _ = daemon.end(signal.SIGTERM)
         assert (code, said) == (0, "")
-        check(tmp_path / "s", 0)
+        blocks, lost = recorded(tmp_path / "s")
+        # On a busy machine the folder is away for longer than the queue of frames has room for.
+        assert sorted([*blocks, *lost]) == list(range(len(blocks) + len(lost)))
+        assert len(blocks) >= frames
