@@ -33,6 +33,7 @@ from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
 from recording.writing.telemetry import TelemetryEncoder
 from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
+from tests.recording.recordings import DEVICES
 
 ROUNDS = 50
 START_NS = 1_767_290_400 * NS_PER_S
@@ -41,15 +42,6 @@ HEIGHT_px, WIDTH_px = 2048, 2448
 FRAMES_PER_SEGMENT = 200  # 1.0 GB
 SEGMENTS = 5
 NIGHT_s = 16 * 3600
-DEVICES = {
-    "thermometers": "thermometers",
-    "regulator": "regulator",
-    "relays": "relays",
-    "camera": "camera",
-    "linear": "axis",
-    "rotary": "axis",
-    "flap": "flap",
-}
 TEMPERATURES = tuple(f"thermometers.{place}" for place in kinds.THERMOMETERS)
 TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in kinds.THERMOMETERS)
 METADATA = {"session_id": "bench"}

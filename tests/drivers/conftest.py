@@ -1,4 +1,5 @@
-"""A Modbus peer that is not ours: pymodbus servers over TCP and over a pair of joined pseudo-terminals."""
+"""A Modbus peer that is not ours: pymodbus servers over TCP and over a pair of joined pseudo-terminals; and a bus
+whose far end answers as a test tells it to."""
 
 from __future__ import annotations
 
@@ -8,11 +9,18 @@ import select
 import threading
 import tty
 from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
 
 import pytest
 from pymodbus.pdu import ModbusPDU
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import SimDevice
+
+from drivers.sim.faults import LinkFaults
+from drivers.sim.wire import PtyWire
+from drivers.wires.bus import Bus, BusSettings
+from foundation.clock import WallClock
+from tests.drivers.bus_responder import TIMEOUT_S, Responder
 
 Serve = Callable[[list[SimDevice], list[type[ModbusPDU]]], Awaitable[str]]
 
@@ -65,3 +73,20 @@ async def serve_modbus(request: pytest.FixtureRequest) -> AsyncIterator[Serve]:
             return f"serial:{cable.right}"
 
         yield serve
+
+
+@pytest.fixture
+def responder() -> Responder:
+    """The far end of `bus`."""
+    return Responder()
+
+
+@pytest.fixture
+async def bus(responder: Responder, tmp_path: Path) -> AsyncIterator[Bus]:
+    """A bus whose far end answers as it is told to."""
+    wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
+    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S, gap_s=0.0), WallClock())
+    await bus.open()
+    yield bus
+    await bus.close()
+    wire.close()

@@ -7,7 +7,7 @@ import os
 import random
 import select
 import tty
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -57,21 +57,6 @@ def wrong_value(request: bytes, reply: bytes) -> bytes:
 
 def exception(code: int) -> Fault:
     return lambda request, reply: frame(bytes([request[0], request[1] | 0x80, code]))
-
-
-@pytest.fixture
-def responder() -> Responder:
-    return Responder()
-
-
-@pytest.fixture
-async def bus(responder: Responder, tmp_path: Path) -> AsyncIterator[Bus]:
-    wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
-    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S, gap_s=0.0), WallClock())
-    await bus.open()
-    yield bus
-    await bus.close()
-    wire.close()
 
 
 async def test_a_pymodbus_server_is_read_and_written_in_all_four_spaces(serve_modbus: Serve) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -30,21 +29,6 @@ class NumberlessResponder(MbapResponder):
     def feed(self, data: bytes) -> bytes:
         reply = super().feed(data)
         return reply and bytes(2) + reply[2:]
-
-
-@pytest.fixture
-def responder() -> Responder:
-    return Responder()
-
-
-@pytest.fixture
-async def bus(responder: Responder, tmp_path: Path) -> AsyncIterator[Bus]:
-    wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
-    bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S, gap_s=0.0), WallClock())
-    await bus.open()
-    yield bus
-    await bus.close()
-    wire.close()
 
 
 async def test_a_dead_unit_is_skipped_and_probed_at_growing_intervals_and_the_other_keeps_going(

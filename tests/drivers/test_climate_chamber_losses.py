@@ -18,7 +18,7 @@ from tests.drivers.chamber_bench import ALLOWED_DEGC, MAKES, ON_WIRES, WIRES, be
 async def test_a_late_reply_is_never_taken_for_the_next_one(make: str, wire: str, tmp_path: Path):
     async with bench_of(make, wire, tmp_path) as bench:
         await bench.driver.open()
-        for value_degC in (30.0, 35.0):
+        for value_degC in (30.0, 35.0, 40.0):
             bench.faults.hold()
             bench.fake.stuck_degC = value_degC - 1
             with pytest.raises(DeviceError) if wire == "tcp" else _nothing():

@@ -12,6 +12,7 @@ from stand.assembly import assemble
 from stand.config.recipe import Recipe
 from stand.config.safe_ranges import largest_correction_K
 from stand.config.stand_config import load_config, packaged
+from tests.nightly import by_night
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LABORATORY = yaml.safe_load((CONFIGS / "laboratory.yaml").read_text())
@@ -263,6 +264,8 @@ def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path
     [
         ("name: " + "[\n" * 5000 + "]" * 5000, "nested too deeply"),
         ("name: " + "[\n" * 120_000, "nested too deeply"),
+        by_night("name: " + "[" * 5000 + "]" * 5000, "nested too deeply"),  # PyYAML takes a second for one line
+        by_night("name: " + "[" * 120_000, "nested too deeply"),
         ("name: " + "1" * 5000, "5000 digits"),
         ("name: 0x" + "f" * 9000, "name: give text, in quotes: "),
         ("name: 2026-13-45", "month must be in 1..12"),
@@ -270,7 +273,18 @@ def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path
         ("name: !!int ''", "does not fit its tag"),
         ("name: !!timestamp x", "does not fit its tag"),
     ],
-    ids=["nested", "nested beyond any stack", "digits", "hexadecimal", "date", "bool", "int", "timestamp"],
+    ids=[
+        "nested",
+        "nested beyond any stack",
+        "nested in a line",
+        "beyond any stack in a line",
+        "digits",
+        "hexadecimal",
+        "date",
+        "bool",
+        "int",
+        "timestamp",
+    ],
 )
 def test_yaml_that_python_cannot_hold_is_refused_with_a_sentence(tmp_path: Path, text: str, sentence: str):
     file = tmp_path / "hostile.yaml"

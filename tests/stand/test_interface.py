@@ -5,9 +5,6 @@ import contextlib
 import json
 import os
 import stat
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,10 +14,9 @@ from stand.serving.api.listening import MOST_CLIENTS
 from stand.serving.client import running_sessions
 from stand.serving.desk import RunStatus
 from stand.serving.presence import address_in, living, opened_folder
-from tests import forked
 from tests.asking import ask, ask_status
 from tests.stand.a_desk import ADesk, served
-from tests.stand.interface_client import DAEMON, entries_of, obeys
+from tests.stand.interface_client import entries_of, obeys
 
 STATUS = RunStatus(
     recipe="thermal-cycle",
@@ -197,26 +193,6 @@ async def test_paths_longer_than_the_kernel_takes_are_served(tmp_path: Path, mon
         assert await asyncio.to_thread(running_sessions, session.parent) == [session]
     assert list(session.iterdir()) == []
     assert list((runtime / "thermostand").iterdir()) == []
-
-
-@pytest.fixture
-def daemon() -> Iterator[Callable[[Path], "subprocess.Popen[str]"]]:
-    started = []
-
-    def start(session: Path) -> "subprocess.Popen[str]":
-        process = forked.popen(
-            [sys.executable, "-m", "tests.code", DAEMON, str(session)], stdout=subprocess.PIPE, text=True
-        )
-        started.append(process)
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        return process
-
-    yield start
-    for process in started:
-        process.kill()
-        process.wait()
-        process.stdout.close()
 
 
 async def test_an_operator_holds_releases_clears_and_stops_the_run(tmp_path: Path):

@@ -19,7 +19,7 @@ from tests.asking import ask
 from tests.stand.a_desk import ADesk, served
 
 STATE = b"GET /api/v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
-LOOKS, PERIOD_S = 40, 0.02
+LOOKS, PERIOD_S = 60, 0.02
 
 
 def connected(session: Path) -> socket.socket:

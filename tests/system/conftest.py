@@ -9,6 +9,8 @@ import pytest
 import yaml
 
 from drivers.framing.aravis_library import library
+from drivers.sim.gige.camera import FakeCamera
+from foundation.clock import WallClock
 from foundation.documents import load_document, yaml_data
 from foundation.errors import StandError
 from stand.config.recipe import Recipe
@@ -18,6 +20,7 @@ from stand.simulator import Simulator, laboratory_of
 from tests.addresses import move_to_free
 from tests.forked import OWN_HELPERS
 from tests.sections import change
+from tests.system.camera_bench import START_NS, WarmPlant, simulated
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.
@@ -148,3 +151,16 @@ def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Calla
     path.write_text(yaml.safe_dump(data))
     simulator(load_config(path), False)
     return path
+
+
+@pytest.fixture
+def plant() -> WarmPlant:
+    """What a camera by itself sees."""
+    return WarmPlant(START_NS)
+
+
+@pytest.fixture
+def fake(plant: WarmPlant) -> Iterator[FakeCamera]:
+    """A camera in real time."""
+    with simulated(WallClock(), plant) as camera:
+        yield camera

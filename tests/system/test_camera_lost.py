@@ -1,54 +1,33 @@
 """The camera driver against a camera whose packets, frames or control are lost, and that is lost itself."""
 
 import asyncio
-import os
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import pytest
 
 from drivers.devices.cameras.camera_gige import Camera
-from drivers.framing.aravis_library import library
 from drivers.sim.gige.camera import FakeCamera
 from drivers.wires import camera_connection
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import Refused, StandError, Unreachable
+from foundation.errors import Refused, Unreachable
 from tests.addresses import usual_camera_address
 from tests.system.camera_bench import (
     EXPOSURE_S,
-    START_NS,
     HEIGHT_px,
     WarmPlant,
     WIDTH_px,
     noise,
     opened,
     settings,
-    simulated,
     virtual,
 )
+from tests.system.conftest import require_aravis
 
 
 @pytest.fixture(autouse=True, scope="module")
 def aravis() -> None:
-    try:
-        library()
-    except StandError as error:
-        if os.environ.get("CI") == "true":
-            raise
-        pytest.skip(str(error))
-
-
-@pytest.fixture
-def plant() -> WarmPlant:
-    return WarmPlant(START_NS)
-
-
-@pytest.fixture
-def fake(plant: WarmPlant) -> Iterator[FakeCamera]:
-    """A camera in real time."""
-    with simulated(WallClock(), plant) as camera:
-        yield camera
+    require_aravis()
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.05, 1), (0.01, 10)])

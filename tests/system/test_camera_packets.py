@@ -19,11 +19,6 @@ FRAMES = 5
 
 
 @pytest.fixture
-def plant() -> WarmPlant:
-    return WarmPlant(1_700_000_000 * NS_PER_S)
-
-
-@pytest.fixture
 async def wired(plant: WarmPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
     async with virtual(plant) as both:
         yield both

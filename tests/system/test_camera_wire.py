@@ -2,19 +2,16 @@
 
 import asyncio
 import math
-import os
-from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
 import pytest
 
 from drivers.devices.cameras.camera_gige import Camera
-from drivers.framing.aravis_library import library
 from drivers.sim.gige.camera import FakeCamera
 from drivers.wires.camera_settings import TemperatureFeature
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import DeviceFault, Refused, StandError
+from foundation.errors import DeviceFault, Refused
 from foundation.readings import Quality
 from tests.system.camera_bench import (
     EXPOSURE_S,
@@ -27,28 +24,12 @@ from tests.system.camera_bench import (
     simulated,
     virtual,
 )
+from tests.system.conftest import require_aravis
 
 
 @pytest.fixture(autouse=True, scope="module")
 def aravis() -> None:
-    try:
-        library()
-    except StandError as error:
-        if os.environ.get("CI") == "true":
-            raise
-        pytest.skip(str(error))
-
-
-@pytest.fixture
-def plant() -> WarmPlant:
-    return WarmPlant(START_NS)
-
-
-@pytest.fixture
-def fake(plant: WarmPlant) -> Iterator[FakeCamera]:
-    """A camera in real time."""
-    with simulated(WallClock(), plant) as camera:
-        yield camera
+    require_aravis()
 
 
 @pytest.mark.parametrize("wanted", [SERIAL, None], ids=["of a configured number", "of any number"])

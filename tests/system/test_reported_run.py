@@ -162,7 +162,6 @@ def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, confi
     assert ">Warm-up<" in (Path(session) / REPORT_NAME).read_text(encoding="utf-8")
 
 
-@pytest.mark.nightly  # by day tests/compensation/test_report.py has such a page, and a warm-up a run without a model
 @pytest.mark.usefixtures("_aravis")
 def test_frames_of_ones_own_steps_have_a_report_of_what_there_is(out: Path, config_text: Callable[..., str]):
     ended = run_here(OWN_STEPS, config_text(camera=WHOLE_SENSOR), out)
