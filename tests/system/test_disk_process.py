@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from foundation.errors import SessionError
-from recording.reading.gaps import FRAMES_DROPPED
+from recording.reading.gaps import reported_blocks
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 from recording.writing import locks
@@ -104,8 +104,7 @@ def recorded(directory):
     """The numbers of the frames that are in the session, and of those that it says were lost."""
     salvage_session(directory)
     session = Session.open(directory)
-    spans = [span for event in session.events() if event.kind == FRAMES_DROPPED for span in event.data["blocks"]]
-    lost = {block for first, last in spans for block in range(first, last + 1)}
+    lost = {block for blocks in reported_blocks(session.events()) for block in blocks}
     return [frame.block_id for frame in session.frames()], lost
 
 
