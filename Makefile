@@ -13,6 +13,8 @@ BIN := $(VENV)/bin
 WORKERS := $(shell workers=$$(($$(nproc) * 3)); echo $$((workers < 12 ? workers : 12)))
 # MB that pyright's new objects may take: its garbage is collected less often, which saves 4 % of its processor time.
 CHECKER_OPTIONS := --max-semi-space-size=128
+# Pyright runs on the Node.js that is installed with it: an older one of the system takes a fifth more processor time.
+export PYRIGHT_PYTHON_GLOBAL_NODE := 0
 RUNTIME_PACKAGES := libaravis-0.8-0 libusb-1.0-0
 PEER_PACKAGES := aravis-tools-cli aravis-tools chromium-headless-shell/chromium gcc libc6-dev
 
