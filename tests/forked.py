@@ -27,9 +27,11 @@ from typing import Any, NoReturn
 
 _ENTRIES = {"drivers.sim": "drivers.sim.__main__:main", "stand.cli": "stand.cli:app"}
 """Of what `python -m` starts, what runs it; of other modules it is `main`."""
+_INTERFACE = ("stand.serving.api.app", "stand.serving.api.listening", "stand.serving.api.stream")
+"""Modules that a daemon imports when it begins to answer."""
 _LOADED = {
-    "stand.cli": ("stand.commands.run_cli", "stand.commands.serve_cli", "stand.commands.queue_cli"),
-    "tests.code": ("stand.running.run", "stand.queueing.queue_work", "stand.serving.api.server"),
+    "stand.cli": ("stand.commands.run_cli", "stand.commands.serve_cli", "stand.commands.queue_cli", *_INTERFACE),
+    "tests.code": ("stand.running.run", "stand.queueing.queue_work", "stand.serving.api.server", *_INTERFACE),
     "recording.writing.disk": ("recording.writing.recorder", "stand.queueing.queue_work"),
     "stand.serving.preview_process": ("stand.serving.preview", "stand.serving.recorded_drift"),
 }

@@ -89,7 +89,7 @@ class Frames:
             try:
                 self._queue.put_nowait(item)
             except asyncio.QueueFull:
-                self.losses.count(item, "the disk is too slow")
+                self.losses.count(item, "the disk did not take them in time")
                 self._waiting.frame_refused(now_ns)
             else:
                 self.taken += 1

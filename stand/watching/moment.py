@@ -94,10 +94,13 @@ def not_yet_safe(state: StandState) -> Iterable[str]:
     """A sentence for each part that has not confirmed its safe state."""
     for part in state.not_confirmed:
         since = local_text(part.since_ns + state.utc_offset_ns)
-        found = f"{part.reason}; it is tried until it does" if part.reason else f"{part.name} is being made safe"
+        found = (
+            f"{part.reason}; it is tried again until it confirms" if part.reason else f"{part.name} is being made safe"
+        )
         yield f"since {since}: {found}"
         if part.reason and part.timer_s is not None:
-            yield f"heat and cold: the relay board's own timer ends them, {part.timer_s:g} s after that"
+            latest = f"at the latest {part.timer_s:g} s after that time"
+            yield f"heat and cold: the relay board's own timer ends them, {latest}"
 
 
 def _value(state: StandState, channel: str) -> float | None:

@@ -42,7 +42,10 @@ async def test_frames_beyond_the_queue_are_dropped_counted_and_reported(tmp_path
     assert session.frame_count == 20
     (event,) = session.events()
     assert (event.level, event.kind) == ("error", "frames_dropped")
-    assert event.text == "frames lost: 10 (blocks 20 to 29 of step capture-1), 10 in all; the disk is too slow"
+    assert (
+        event.text
+        == "frames lost: 10 (blocks 20 to 29 of step capture-1), 10 in all; the disk did not take them in time"
+    )
 
 
 def notes(time_ns, index):

@@ -88,8 +88,8 @@ async def test_status_begins_with_what_is_not_confirmed_safe(tmp_path: Path, run
         desk.not_confirmed = ()
         assert "not safe" not in (await invoke("status", path)).stdout
     assert lines[:2] == [
-        f"not safe yet  since 2026-01-01 17:59:00 UTC: {failure}; it is tried until it does",
-        "not safe yet  heat and cold: the relay board's own timer ends them, 15 s after that",
+        f"not safe yet  since 2026-01-01 17:59:00 UTC: {failure}; it is tried again until it confirms",
+        "not safe yet  heat and cold: the relay board's own timer ends them, at the latest 15 s after that time",
     ]
 
 

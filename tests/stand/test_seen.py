@@ -33,8 +33,8 @@ async def test_after_a_stop_while_a_wire_is_gone_it_is_told_what_is_not_confirme
         failure = "relays did not confirm its safe state: relays: no answer"
         assert seen(here).not_confirmed == (NotConfirmed(name="relays", since_ns=0, reason=failure, timer_s=15.0),)
         assert list(not_yet_safe(seen(here))) == [
-            f"{BEGIN}: {failure}; it is tried until it does",
-            "heat and cold: the relay board's own timer ends them, 15 s after that",
+            f"{BEGIN}: {failure}; it is tried again until it confirms",
+            "heat and cold: the relay board's own timer ends them, at the latest 15 s after that time",
         ]
         await here.passes(6.0)
         assert seen(here).not_confirmed == ()

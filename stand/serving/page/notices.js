@@ -128,8 +128,8 @@ function chamber_of({ heater_permitted, setpoint_degC, readings }) {
 function not_yet({ name, since_ns, reason, timer_s }, { utc_offset_ns }) {
   const since = `Since ${clock(seconds(since_ns, utc_offset_ns), true)}`;
   if (!reason) return `${since}: ${words(name)} is being made safe.`;
-  const timer = timer_s === null ? "" : ` Heat and cold cannot be switched off through it now: the relay board's own timer ends them, ${timer_s} s after that.`;
-  return `${since}: ${reason}. It is tried until it does.${timer}`;
+  const timer = timer_s === null ? "" : ` Heat and cold cannot be switched off through it now: the relay board's own timer ends them, at the latest ${timer_s} s after that time.`;
+  return `${since}: ${reason}. It is tried again until it confirms.${timer}`;
 }
 
 const of = (reading) => (reading.value === null ? `no reading: ${reading.reason}` : `${number(reading.value, 2)} ${unit_of(reading.unit)}`);
