@@ -20,8 +20,9 @@ from tests.stock_camera import run_stock_camera
 from tests.workers import run_units
 
 # How long an example takes says how busy the machine is.
-settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("untimed")
+settings.register_profile("day", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=50)
+settings.register_profile("night", settings.get_profile("day"), max_examples=500)
+settings.load_profile("day")
 
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
 _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera.py"}
@@ -60,7 +61,7 @@ def pytest_collection_finish() -> None:
     """The garbage of the tests is collected, as of any program, but less often: they make many objects, few of them
     rings."""
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
+    gc.set_threshold(100_000, 20, 20)
     gc.enable()
 
 
