@@ -36,8 +36,7 @@ test: setup
 
 nightly: setup
 	@sh .ci/system-packages $(PEER_PACKAGES)
-	$(BIN)/pytest -m nightly -o faulthandler_timeout=5400
-	$(BIN)/pytest -m "hypothesis and not nightly" --hypothesis-profile=night
+	$(BIN)/pytest -m "nightly or hypothesis" --hypothesis-profile=night -o faulthandler_timeout=5400
 
 bench: setup
 	$(BIN)/python -m tests.bench

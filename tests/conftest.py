@@ -20,7 +20,7 @@ from tests.stock_camera import run_stock_camera
 from tests.workers import run_units
 
 # How long an example takes says how busy the machine is.
-settings.register_profile("day", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=50)
+settings.register_profile("day", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("night", settings.get_profile("day"), max_examples=500)
 settings.load_profile("day")
 

@@ -24,7 +24,7 @@ experiments:
       set_points_degC: [24]
       held_out_degC: []
       dwell_s: 60
-      reference_frames: 2
+      reference_frames: 3
       frames_per_point: 2
 """
 
@@ -43,12 +43,12 @@ async def test_roi_keeps_the_markers_and_a_whole_frame_of_each_capture(tmp_path:
     )
     session = Session.open(directory)
     windows = [frame.windows for frame in session.frames()]
-    assert [0 if window is None else len(window) for window in windows] == [0, 54, 0, 54]
+    assert [0 if window is None else len(window) for window in windows] == [0, 54, 54, 0, 54]
     observed = observe_session(session, session_target(session))
     assert observed.usable.all()
     assert not np.isnan(observed.centres_px).any()
     sizes = [len(image.data) for image in session.images()]
-    assert max(sizes[1], sizes[3]) < min(sizes[0], sizes[2]) / 4
+    assert max(sizes[1], sizes[2], sizes[4]) < min(sizes[0], sizes[3]) / 4
 
 
 async def test_a_run_first_salvages_what_a_killed_one_has_left(tmp_path: Path, order: Callable[..., Order]):
