@@ -12,6 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
@@ -24,6 +25,7 @@ NOTES_NAME = "notes.jsonl"
 LONGEST_NOTE = 4000  # characters
 LIMIT_BYTES = 4_000_000
 _TAG = re.compile(r"[^\W_][\w.:+-]{0,39}")
+_APPENDING = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _NOTE, _TAGS, _UNTAG, _ARCHIVED = "note", "tags", "untag", "archived"
 
 
@@ -104,23 +106,41 @@ def check_tag(tag: str) -> str:
 
 
 def _append(directory: Path, fields: Mapping[str, object]) -> None:
-    """One line, behind whatever is there; the end of a line that was torn stays apart from it."""
+    """One line, behind whatever is there; the end of a line that was torn stays apart from it.
+
+    The folder is opened first and not through a symbolic link, so that nothing is ever written elsewhere. What the disk
+    took of a line that it did not take whole is cut off again.
+    """
     path = directory / NOTES_NAME
     line = journal_line(json.dumps(fields, ensure_ascii=False).encode(errors="replace"))
     try:
-        fd = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
-        try:
+        with ExitStack() as opened:
+            folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+            opened.callback(os.close, folder)
+            fd = os.open(NOTES_NAME, _APPENDING, 0o644, dir_fd=folder)
+            opened.callback(os.close, fd)
             fcntl.flock(fd, fcntl.LOCK_EX)
             status = os.fstat(fd)
             if not stat.S_ISREG(status.st_mode) or status.st_size + len(line) > LIMIT_BYTES:
                 raise SessionError(f"{path}: is no file of notes, or is full")
             torn = status.st_size and os.pread(fd, 1, status.st_size - 1) != b"\n"
-            os.write(fd, b"\n" + line if torn else line)
+            _write_whole(fd, b"\n" + line if torn else line, status.st_size)
             os.fsync(fd)
-        finally:
-            os.close(fd)
+            os.fsync(folder)  # the file may be new
     except OSError as error:
-        raise SessionError(f"{path}: the note could not be kept ({error.strerror})") from error
+        why = "the folder is a symbolic link" if directory.is_symlink() else error.strerror
+        raise SessionError(f"{path}: the note could not be kept ({why})") from error
+
+
+def _write_whole(fd: int, data: bytes, size_bytes: int) -> None:
+    """All of it behind the `size_bytes` that are there, or nothing and OSError: a disk that fills up takes a part."""
+    written = 0
+    try:
+        while written < len(data):
+            written += os.write(fd, data[written:])
+    except OSError:
+        os.ftruncate(fd, size_bytes)
+        raise
 
 
 def _folded(entries: Iterable[dict[str, object]]) -> Notes:

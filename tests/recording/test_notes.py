@@ -1,6 +1,8 @@
 """Notes and tags of a session: kept with who and when, only ever added to, whatever the file has come to."""
 
 import os
+import subprocess
+import sys
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
@@ -65,6 +67,38 @@ def test_links_and_pipes_are_no_notes(tmp_path: Path):
     assert read_notes(tmp_path) == Notes()
     with pytest.raises(SessionError, match="is no file of notes"):
         add_note(tmp_path, "x", "eva", 1)
+
+
+def test_a_note_that_a_full_disk_takes_in_part_is_refused_and_leaves_nothing(tmp_path: Path):
+    code = """
+import resource, signal, sys
+from pathlib import Path
+from foundation.errors import SessionError
+from recording.reading.notes import add_note, add_tags
+folder = Path(sys.argv[1])
+add_note(folder, "first", "eva", 1)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+size = (folder / "notes.jsonl").stat().st_size
+resource.setrlimit(resource.RLIMIT_FSIZE, (size + 20, size + 20))  # a write across it is a short one, the next fails
+try:
+    add_tags(folder, ["keep"], "eva", 2)
+except SessionError:
+    sys.exit(0 if (folder / "notes.jsonl").stat().st_size == size else 4)
+sys.exit(3)
+"""
+    assert subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False).returncode == 0
+    assert read_notes(tmp_path).tags == ()
+    add_tags(tmp_path, ["keep"], "eva", 3)
+    assert read_notes(tmp_path) == Notes((Note(1, "eva", "first"),), ("keep",))
+
+
+def test_a_folder_that_is_a_link_gets_no_note(tmp_path: Path):
+    other = tmp_path / "elsewhere"
+    other.mkdir()
+    (tmp_path / "night").symlink_to(other)
+    with pytest.raises(SessionError, match="symbolic link"):
+        add_note(tmp_path / "night", "x", "eva", 1)
+    assert list(other.iterdir()) == []
 
 
 def test_notes_given_at_once_are_all_kept(tmp_path: Path):
