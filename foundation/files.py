@@ -27,7 +27,7 @@ def unreadable(path: Path | str, error: OSError | UnicodeDecodeError) -> str:
 def replace_file(path: Path, data: bytes) -> None:
     """`data` as the file `path`, complete and on the disk when this returns, also when others write one of that name at
     the same time; its folder is made. Raises OSError, and then a file that was there before is unchanged."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_durable_folder(path.parent)
     temporary = _beside(path)
     try:
         with temporary.open("wb") as file:
@@ -83,10 +83,21 @@ def check_writable(path: Path) -> None:
     _temporary(path).unlink()
 
 
+def make_durable_folder(path: Path) -> None:
+    """The folder, with those above it, unless it is there; each new name is on the disk when this returns: what is
+    synced into a folder whose own name is not would be lost with it. Raises OSError."""
+    if path.is_dir():
+        return
+    if path.parent != path:
+        make_durable_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync_folder(path.parent)
+
+
 def make_folder(path: Path) -> None:
-    """The folder, with those above it, unless it is there; SessionError when the place refuses."""
+    """As `make_durable_folder`; SessionError when the place refuses."""
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(path)
     except OSError as error:
         raise SessionError(f"{path}: cannot be made ({error.strerror})") from error
 
@@ -148,7 +159,7 @@ def new_folder(out: Path) -> Generator[Path]:
     when it does not, it is removed. SessionError when `out` exists or the disk refuses."""
     part = out.parent / f"{out.name}.part"
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(out.parent)
         if out.exists():
             raise SessionError(f"{out}: exists already; choose another name or move it away")
         if part.exists():

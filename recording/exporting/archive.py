@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import cast
 
 from foundation.errors import SessionError
-from foundation.files import replace_file, sync_folder
+from foundation.files import make_durable_folder, replace_file, sync_folder
 from foundation.json_values import json_object
 from foundation.lock_file import try_lock
 from recording.format.inventory import State, inventory
@@ -75,7 +75,7 @@ def archive(entry: Entry, to: Path, by: str, now_ns: int, report: Report = lambd
         if not _is_copy(copy, contents):
             if os.path.lexists(copy):
                 raise SessionError(f"{copy}: is there already and is another session, or an older state of this one")
-            part.mkdir(parents=True, exist_ok=True)
+            make_durable_folder(part)
             _check_room(entry, to, part)
             _clear(part, set(_files(entry.path)))
             sums = {name: _copied(entry.path / name, part / name, report) for name in sorted(_files(entry.path))}
@@ -179,7 +179,7 @@ def _copied(source: Path, target: Path, report: Report) -> str:
     if not source.is_file():
         return ""
     is_there = target.is_file() and target.stat().st_size == source.stat().st_size and target.name != NOTES_NAME
-    target.parent.mkdir(parents=True, exist_ok=True)
+    make_durable_folder(target.parent)
     growing = target.with_name(f".{target.name}.copying")
     digest = hashlib.blake2b(digest_size=16)
     with source.open("rb") as read, open(os.devnull if is_there else growing, "wb") as written:

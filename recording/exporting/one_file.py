@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 from foundation.errors import SessionError
-from foundation.files import sync_folder
+from foundation.files import make_durable_folder, sync_folder
 from recording.exporting.topics import recorded_topics
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
 from recording.format.layout import DEVICES, SESSION_METADATA
@@ -45,7 +45,7 @@ def export_mcap(
     if out.exists() or part.exists():
         raise SessionError(f"{out if out.exists() else part}: is in the way; remove it or choose another name")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(out.parent)
         with part.open("wb") as file:
             compression = CompressionType.NONE if frames and session.frame_count else CompressionType.ZSTD
             writer = Writer(file, _CHUNK_BYTES, compression)

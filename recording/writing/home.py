@@ -7,7 +7,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from foundation.files import sync_folder
+from foundation.files import make_durable_folder, sync_folder
 
 
 class FolderLost(OSError):
@@ -41,7 +41,7 @@ class Home:
 
     def _made(self) -> int:
         """A descriptor of the folder at this place, which is made where there is none, durably."""
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(self._folder)
         for folder in (self._folder.parent, self._folder.absolute().parent.parent):
             sync_folder(folder)
         return os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from foundation.files import sync_folder
+from foundation.files import make_durable_folder, sync_folder
 from recording.format.chain import foreign_numbers
 from recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
 from recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
@@ -192,7 +192,7 @@ class SessionSeries:
 
     def __init__(self, directory: Path, form: SessionForm, time_ns: int) -> None:
         for name in (FRAMES, TELEMETRY):
-            (directory / name).mkdir(parents=True, exist_ok=True)
+            make_durable_folder(directory / name)
         sync_folder(directory)
         sync_folder(directory.parent)
         frames, telemetry = Series(directory / FRAMES, form.frames()), Series(directory / TELEMETRY, form.telemetry())

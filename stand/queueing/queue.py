@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from foundation.errors import SessionError, StandTripped
+from foundation.files import make_folder
 from stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
 
 if TYPE_CHECKING:
@@ -69,10 +70,7 @@ def add(directory: Path, order: Order, config: str, now_ns: int) -> Entry:
 def append(directory: Path, entry: Entry) -> Entry:
     """Queue it behind all others, with a number of its own. With the key of an earlier run: that one. SessionError
     when the request of that key was another."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SessionError(f"{directory}: cannot be made ({error.strerror})") from error
+    make_folder(directory)
     with changing(directory) as draft:
         earlier = next((each for each in draft.queue.entries if entry.key and each.key == entry.key), None)
         if earlier is not None:
