@@ -23,6 +23,9 @@ from foundation.files import replace_file
 
 QUEUE_NAME = "queue.json"
 LAST_NAME = "queue.json.last"
+KEPT_ENDED = 100
+"""So many of the runs that have ended stay in the file, the latest: with its three texts a run has 9 kB, and the whole
+file is written at each change. What was run stays in its session."""
 _LOCK_NAME = ".queue.lock"
 _WORKER_NAME = ".queue.worker"
 
@@ -132,7 +135,7 @@ def changing(directory: Path) -> Generator[Draft]:
         draft = Draft(_settled(directory, before))
         yield draft
         if draft.queue != before:
-            _store(directory, draft.queue)
+            _store(directory, _pruned(draft.queue))
 
 
 @contextmanager
@@ -154,6 +157,13 @@ def worked_on(directory: Path) -> ExitStack:
     stack = ExitStack()
     stack.enter_context(working(directory))
     return stack
+
+
+def _pruned(queue: Queue) -> Queue:
+    """Without all but the latest of the runs that have ended."""
+    ended = [entry.id for entry in queue.entries if not entry.is_open and entry.state is not State.RUNNING]
+    old = frozenset(ended[:-KEPT_ENDED])
+    return queue.model_copy(update={"entries": tuple(entry for entry in queue.entries if entry.id not in old)})
 
 
 def _settled(directory: Path, queue: Queue) -> Queue:

@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from foundation.errors import ConfigError, SessionError, StandTripped
 from stand.queueing import queue
-from stand.queueing.queue_file import LAST_NAME, QUEUE_NAME, State, working
+from stand.queueing.queue_file import KEPT_ENDED, LAST_NAME, QUEUE_NAME, State, changing, working
 from stand.running.order import Order, load_order
 from tests import forked
 
@@ -192,6 +192,18 @@ def test_an_interrupted_run_keeps_its_session_and_comes_first(tmp_path: Path):
             queue.remove(tmp_path, 1)
         with pytest.raises(SessionError, match="run 1 is running; only a run that is still to be done"):
             queue.move(tmp_path, 1, 1)
+
+
+def test_of_the_runs_that_have_ended_the_latest_are_kept(tmp_path: Path):
+    waiting = add(tmp_path)
+    ended = tuple(
+        queue.queued(tmp_path).entries[0].model_copy(update={"id": number, "state": State.DONE})
+        for number in range(2, KEPT_ENDED + 20)
+    )
+    with changing(tmp_path) as draft:
+        draft.set(entries=(*ended, *draft.queue.entries), next_id=1000)
+    assert [number for number, _ in states(tmp_path)] == [each.id for each in ended[-KEPT_ENDED:]] + [waiting]
+    assert add(tmp_path) == 1000
 
 
 def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
