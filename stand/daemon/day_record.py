@@ -1,7 +1,8 @@
 """The daemon's own record between runs: one session a day, `20261122-house`, begun at local midnight.
 
 What is done by hand is recorded as in a run, and heat depends on it in the same way. While a run records, the
-daemon does not: each instant is in one session.
+daemon does not: each instant is in one session. Old ones are removed (`recording.idle_log_days`), but none that has a
+note or a tag.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from __future__ import annotations
 import asyncio
 import itertools
 import os
+import re
+import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,7 +25,9 @@ from foundation.hub import Hub, Subscriber
 from foundation.items import Event, Item
 from foundation.patience import Patience
 from foundation.tasks import cancelled
+from recording.exporting.archive import DELETED
 from recording.reading.contents import RUN_END
+from recording.reading.notes import read_notes
 from recording.reading.run_word import Run
 from recording.reading.session import Session
 from recording.writing.disk import Disk
@@ -31,6 +37,7 @@ from stand.assembly import Assembly
 from stand.running.session_files import info_of, recorder_in, tell_identities
 
 BETWEEN_RUNS = "house"  # in place of a recipe's name
+_NAME = re.compile(rf"([0-9]{{8}})-{BETWEEN_RUNS}(-[0-9]+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +73,10 @@ class DayRecord:
         self._now: _Recording | None = None
         self._cut_off: list[_Recording] = []  # they take nothing any more, and are not complete yet
         self._day = ""
+        self._removal: asyncio.Task[None] | None = None
         self._turn = asyncio.Lock()
         self._lane = Lane("day-record", clock, patient=False)  # for a disk that may hang
+        self._removing = Lane("idle-logs", clock, patient=False)  # a long removal keeps no record waiting
 
     @property
     def recorder(self) -> Recorder | None:
@@ -96,6 +105,7 @@ class DayRecord:
             self._day = day
             self._now = _Recording(recorder, tap, disk, asyncio.create_task(recorder.run()))
             tell_identities(self._assembly)
+            self._removal = asyncio.create_task(self._remove_old())
             return recorder
 
     async def complete(self, within_s: float = COMPLETE_WITHIN_S) -> None:
@@ -106,6 +116,8 @@ class DayRecord:
 
     async def end(self, within_s: float = COMPLETE_WITHIN_S) -> None:
         """The same after cutting off what is recorded now. Nothing without `begin`."""
+        if self._removal is not None:
+            await cancelled([self._removal])
         async with self._turn:
             self._cut()
         await self.complete(within_s)
@@ -118,6 +130,15 @@ class DayRecord:
         recording.tap.give(ended)
         recording.tap.close()
         self._cut_off.append(recording)
+
+    async def _remove_old(self) -> None:
+        """Those older than the stand's file allows, reported; what the disk refuses is tried again tomorrow."""
+        days = self._assembly.config.recording.idle_log_days
+        removed = await self._removing.call(remove_idle_logs, self._out, self._today(), days) if days else []
+        if removed:
+            text = f"records between runs older than {days} days were removed: {', '.join(removed)}"
+            event = Event(self._clock.now_ns(), "info", "idle_logs_removed", text, {"names": [*removed], "days": days})
+            self._assembly.hub.publish(event)
 
     def _today(self) -> str:
         now_s = (self._clock.now_ns() + self._clock.utc_offset_ns()) / NS_PER_S
@@ -146,6 +167,32 @@ class DayRecord:
         config = self._assembly.config
         serials = ", ".join(camera.serial_number or "" for camera in config.cameras.values())
         return info_of(BETWEEN_RUNS, name, config, serials, self._clock)
+
+
+def remove_idle_logs(directory: Path, today: str, days: int) -> list[str]:
+    """Remove the records between runs that were begun more than so many days before `today` (YYYYMMDD) and have neither
+    note nor tag; their names. Blocking. What cannot be removed stays."""
+    removed: list[str] = []
+    for path in sorted(directory.glob(f"[0-9]*-{BETWEEN_RUNS}*")):
+        named = _NAME.fullmatch(path.name)
+        if named is None or path.is_symlink() or _age_days(named[1], today) <= days:
+            continue
+        with suppress(SessionError, OSError, LookupError, ValueError):
+            kept = read_notes(path)
+            if Session.open(path).metadata["recipe"] == BETWEEN_RUNS and not kept.notes and not kept.tags:
+                gone = path.with_name(f".{path.name}{DELETED}")  # a reader never sees half of one
+                path.rename(gone)
+                shutil.rmtree(gone)
+                removed.append(path.name)
+    return removed
+
+
+def _age_days(day: str, today: str) -> int:
+    """Of a day, both as YYYYMMDD; 0 for what is no date."""
+    try:
+        return (datetime.strptime(today, "%Y%m%d") - datetime.strptime(day, "%Y%m%d")).days
+    except ValueError:
+        return 0
 
 
 class _Tap(Hub):

@@ -12,15 +12,16 @@ import pytest
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
 from foundation.hub import Hub
-from foundation.items import Batch
+from foundation.items import Batch, Event
 from foundation.patience import Patience
 from foundation.readings import Reading
 from recording.reading.contents import RUN_END
+from recording.reading.notes import add_tags
 from recording.reading.session import Session
 from recording.repair.verify import verify
 from stand.assembly import Assembly
 from stand.config.stand_config import load_config, packaged
-from stand.daemon.day_record import DayRecord
+from stand.daemon.day_record import DayRecord, remove_idle_logs
 
 CONFIG = packaged("", "simulated")
 
@@ -110,3 +111,28 @@ async def test_yesterdays_record_goes_on_when_todays_cannot_be_begun(
         await record.begin()
     assert record.recorder is yesterday
     assert not record.is_of_today()
+
+
+async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_tag(
+    open_stand: tuple[DayRecord, Hub, Calendar], tmp_path: Path
+):
+    record, hub, clock = open_stand
+    said: list[Event] = []
+    hub.subscribe(lambda item: said.append(item) if isinstance(item, Event) else None)
+    names: list[str] = []
+    for _ in range(3):
+        names.append((await record.begin()).directory.name)
+        await record.end(20.0)
+        clock.go_to_midnight(-60.0)
+    add_tags(tmp_path / names[1], ["keep"], "eva", 1)
+    for name in ("20200101-overnight", "20200101-house"):  # a run's, and a folder that is no session
+        (tmp_path / name).mkdir()
+    today = f"{datetime.fromtimestamp(clock.now_ns() / NS_PER_S):%Y%m%d}"
+    assert remove_idle_logs(tmp_path, today, 30) == []
+    clock.ahead_ns += 91 * 24 * 3600 * NS_PER_S
+    latest = (await record.begin()).directory.name
+    while not any(event.kind == "idle_logs_removed" for event in said):
+        await asyncio.sleep(0.01)
+    assert next(event for event in said if event.kind == "idle_logs_removed").data["names"] == [names[0], names[2]]
+    kept = sorted(path.name for path in tmp_path.iterdir())
+    assert kept == sorted(["20200101-house", "20200101-overnight", names[1], latest])
