@@ -8,12 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def take(path: Path, content: bytes) -> int | None:
+def take(path: Path, content: bytes, mode: int = 0o600) -> int | None:
     """The descriptor of the file at `path`, locked and with this content; None when a living process has it locked.
-    What a dead one left is taken over. Raises OSError."""
+    What a dead one left is taken over. mode: of a file that is made. Raises OSError."""
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, mode)
         try:
+            if os.fstat(file).st_uid == os.geteuid():
+                os.fchmod(file, mode)  # whatever the umask
             if not try_lock(file):
                 os.close(file)
                 return None

@@ -16,10 +16,12 @@ from foundation.errors import ConfigError
 from foundation.files import write_whole
 from foundation.output import say, show
 from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.serving.presence import STANDS_FOLDER
 
 app = App()
 
 UNITS, RULES = Path("etc/systemd/system"), Path("etc/udev/rules.d/60-thermostand.rules")
+FOLDERS = Path("etc/tmpfiles.d/thermostand.conf")
 _STOP_S, _WATCHDOG_S = 60, 60  # it asks for more time while the stand is being made safe
 
 
@@ -35,20 +37,26 @@ def service() -> None:
 def install(
     config: Annotated[str, typer.Argument(help="The stand's configuration file.")],
     user: Annotated[str, typer.Option(help="The user it runs as, who owns the sessions.")] = "",
+    group: Annotated[str, typer.Option(help="The group of those who may operate the stand; else that user's.")] = "",
     port: Annotated[int | None, typer.Option(help="As of `stand serve`.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write the files; without it they are only shown.")] = False,
     root: Annotated[Path, typer.Option(help="Where the machine's folders are.", hidden=True)] = Path("/"),
 ) -> None:
-    """Show, and with --yes write, a systemd unit for `stand serve` and udev rules for its devices.
+    """Show, and with --yes write, a systemd unit for `stand serve`, udev rules for its devices, and the locks' folder.
 
     Example: sudo stand service install laboratory.yaml --user operator --yes
     """
     path = packaged("", config).absolute()
     stand = load_config(path)
     name = user or os.environ.get("SUDO_USER") or os.environ.get("USER") or "root"
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}", name):
-        raise ConfigError(f"--user {name}: expected the name of a user")
-    files = {root / UNITS / f"{unit_name(stand)}.service": unit(path, stand, name, port), root / RULES: rules(name)}
+    for option, value in (("--user", name), ("--group", group or name)):
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}", value):
+            raise ConfigError(f"{option} {value}: expected the name of a {option.strip('-')}")
+    files = {
+        root / UNITS / f"{unit_name(stand)}.service": unit(path, stand, name, port),
+        root / RULES: rules(name),
+        root / FOLDERS: folders(group or name),
+    }
     show({"files": {str(file): text for file, text in files.items()}, "written": yes}, _shown(files))
     if not yes:
         say("nothing was written; --yes writes these files")
@@ -58,7 +66,7 @@ def install(
         write_whole(file, text)
     say(
         f"written; now: systemctl daemon-reload && systemctl enable --now {unit_name(stand)}; "
-        "udevadm control --reload && udevadm trigger"
+        f"udevadm control --reload && udevadm trigger; systemd-tmpfiles --create {root / FOLDERS}"
     )
 
 
@@ -97,6 +105,17 @@ RuntimeDirectory=lock/thermostand
 RuntimeDirectoryMode=0700
 RuntimeDirectoryPreserve=yes
 Nice=-5
+# It needs its devices, its network and the folders of its sessions, which may be anywhere.
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+ProtectSystem=full
+ReadWritePaths={_of_unit(str(config.parent))}
+PrivateTmp=yes
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectControlGroups=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
 
 [Install]
 WantedBy=multi-user.target
@@ -112,6 +131,13 @@ SUBSYSTEM=="tty", ATTRS{{idVendor}}=="1cbe", ATTRS{{idProduct}}=="0007", OWNER="
   SYMLINK+="ximc/%s{{serial}}"
 # Serial adapters of the Modbus bus
 SUBSYSTEM=="tty", SUBSYSTEMS=="usb", OWNER="{user}", MODE="0660"
+"""
+
+
+def folders(group: str) -> str:
+    """Where the locks of this machine's stands lie (presence.lock_folder)."""
+    return f"""# The locks of stands: only their operators may take one
+d {STANDS_FOLDER} 2770 root {group} -
 """
 
 

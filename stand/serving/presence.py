@@ -25,6 +25,7 @@ from foundation.lock_file import is_at, remove, take, try_lock
 
 NAME = "thermostand"
 SYSTEM_FOLDER = Path("/run/lock") / NAME
+STANDS_FOLDER = Path("/run/lock") / f"{NAME}-stands"
 _BACKLOG = 128
 
 
@@ -212,6 +213,27 @@ def runtime_folder() -> Path:
         text = f"{folder}: cannot be made ({error.strerror}); set XDG_RUNTIME_DIR to a folder of this user"
         raise SessionError(text) from error
     return folder
+
+
+def lock_folder() -> Path | None:
+    """`/run/lock/thermostand-stands`, where the locks of real stands lie on a machine on which `stand service install`
+    has made it for the stand's group; None where there is none.
+
+    A name that anybody may take first (a world-writable folder, the kernel's abstract sockets) lets any user of the
+    machine keep a stand from its operators. SessionError when others than the group may write there, or this user may
+    not: then he is not one of the stand's operators.
+    """
+    try:
+        found = STANDS_FOLDER.lstat()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise SessionError(f"{STANDS_FOLDER}: cannot be looked at ({error.strerror})") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid not in (0, os.geteuid()) or found.st_mode & stat.S_IWOTH:
+        raise SessionError(f"{STANDS_FOLDER}: is not a folder that root has made for the stand's group; remove it")
+    if not os.access(STANDS_FOLDER, os.R_OK | os.W_OK | os.X_OK):
+        raise SessionError(f"{STANDS_FOLDER}: belongs to the operators of this machine's stands; ask for their group")
+    return STANDS_FOLDER
 
 
 def runtime_folders() -> tuple[Path, ...]:

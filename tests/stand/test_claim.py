@@ -1,10 +1,12 @@
 """A stand's addresses belong to one run of the machine, however they are written and wherever its locks lie."""
 
 import asyncio
+import hashlib
 import json
 import os
 import re
 import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -18,7 +20,9 @@ import yaml
 from foundation.documents import parse_document
 from foundation.errors import InUse, SessionError
 from stand.config.stand_config import StandConfig, packaged
+from stand.running.opening import claim
 from stand.running.opening.claim import addresses, claimed
+from stand.serving import presence
 from tests import forked
 from tests.addresses import move_to_free
 from tests.sections import change
@@ -150,6 +154,30 @@ async def test_a_run_of_another_login_is_found_though_its_files_are_not(
         with pytest.raises(InUse, match=f"camera {camera} is in use by a run of another user or login; nothing was"):
             async with claimed(config(), tmp_path):
                 pass
+
+
+async def test_in_a_folder_of_its_group_nobody_else_takes_the_locks_of_a_real_stand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder, stand = tmp_path / "stands", without_rotary(bus("tcp:192.0.2.1:502"))
+    place = next(address.place for address in addresses(stand) if address.device == "bus")
+    monkeypatch.setattr(presence, "STANDS_FOLDER", folder)
+    monkeypatch.setattr(claim, "STANDS_FOLDER", folder)
+    with socket.socket(socket.AF_UNIX) as anybody:
+        anybody.bind(f"\0thermostand {hashlib.sha256(place.encode()).hexdigest()}")
+        assert not await is_free(stand)
+        folder.mkdir()
+        folder.chmod(0o2770)
+        async with claimed(stand, tmp_path / "night"):
+            assert {stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()} == {0o660}
+            with pytest.raises(InUse, match=f"in use by session {tmp_path / 'night'}"):
+                async with claimed(stand, tmp_path / "other"):
+                    pass
+    assert list(folder.iterdir()) == []
+    folder.chmod(0o2777)
+    with pytest.raises(SessionError, match="is not a folder that root has made"):
+        async with claimed(stand, tmp_path / "night"):
+            pass
 
 
 async def test_a_runtime_folder_that_cannot_be_used_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

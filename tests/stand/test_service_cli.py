@@ -2,12 +2,15 @@
 
 import configparser
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 from typer.testing import CliRunner, Result
 
 from stand.commands.command_table import app
 from stand.config.stand_config import packaged
+from stand.serving.presence import STANDS_FOLDER
 
 CONFIG = packaged("", "simulated")
 
@@ -38,6 +41,20 @@ def test_the_unit_starts_the_daemon_and_gives_it_time_to_make_safe(tmp_path: Pat
     assert 'SYMLINK+="ximc/%s{serial}"' in rules
 
 
+def test_the_unit_may_do_little_and_systemd_reads_it(tmp_path: Path):
+    options = ("--root", str(tmp_path), "--user", "root", "--group", "optics", "--yes")
+    assert installed(*options).exit_code == 0
+    path = tmp_path / "etc/systemd/system/thermostand-simulated-stand.service"
+    wanted = {"NoNewPrivileges=yes", "ProtectSystem=full", "PrivateTmp=yes", "CapabilityBoundingSet="}
+    assert wanted <= set(path.read_text().splitlines())
+    folders = (tmp_path / "etc/tmpfiles.d/thermostand.conf").read_text().splitlines()
+    assert folders[-1] == f"d {STANDS_FOLDER} 2770 root optics -"
+    if systemd := shutil.which("systemd-analyze"):
+        checked = subprocess.run([systemd, "verify", str(path)], capture_output=True, text=True, check=False)
+        assert [line for line in checked.stderr.splitlines() if path.name in line] == []
+
+
 def test_a_user_is_a_name(tmp_path: Path):
     assert installed("--root", str(tmp_path), "--user", "a\nExecStart=b", "--yes").exit_code == 2
     assert list(tmp_path.iterdir()) == []
+    assert installed("--root", str(tmp_path), "--group", "a b", "--yes").exit_code == 2

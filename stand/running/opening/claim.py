@@ -1,8 +1,10 @@
 """One run on one stand: a lock per resolved address, taken before any device is opened, held until it ends or dies.
 
-Each lock is two: a locked file in the runtime folder, which says who has it, and a name in the kernel's abstract socket
-namespace. The name holds among all users of this machine, and when a logout has removed the runtime folder. Another
-host on the same gateway is not kept away.
+Where the machine has a folder for its stands' locks (`presence.lock_folder`), each lock of a real stand is a locked
+file there, which says who has it: only the stand's group can take one. Elsewhere each lock is two: such a file in the
+user's runtime folder, and a name in the kernel's abstract socket namespace, which holds among all users of this
+machine and when a logout has removed the runtime folder, but which any user could take first. Another host on the same
+gateway is not kept away.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import socket
 import threading
 from collections.abc import AsyncGenerator, Generator, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, asynccontextmanager, closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -25,7 +28,7 @@ from foundation.addresses import SerialPlace, place_of
 from foundation.errors import InUse, SessionError
 from foundation.lock_file import remove, take, try_lock
 from stand.config.stand_config import StandConfig
-from stand.serving.presence import runtime_folder, runtime_folders
+from stand.serving.presence import STANDS_FOLDER, lock_folder, runtime_folder, runtime_folders
 
 
 class Address(NamedTuple):
@@ -104,22 +107,24 @@ async def claimed(config: StandConfig, session: Path | None, command: str = "") 
     used.
     """
     wanted = await asyncio.to_thread(addresses, config)
-    with _claimed(wanted, session, config.name, command):
+    with _claimed(wanted, session, config, command):
         yield
 
 
 def _claimed(
-    wanted: Iterable[Address], session: Path | None, stand: str, command: str = ""
+    wanted: Iterable[Address], session: Path | None, config: StandConfig, command: str
 ) -> AbstractContextManager[object]:
     """All of them, or none and what `claimed` raises. In one order for all processes: of two that want the same ones,
     one gets them."""
-    folder = runtime_folder()
     content: dict[str, object] = {"session": os.path.abspath(session) if session else "", "pid": os.getpid()}
-    content |= {"stand": stand, "command": command}
+    content |= {"stand": config.name, "command": command}
+    # Simulated laboratories are nobody's hardware: any user may have one of his own.
+    shared = None if config.simulation is not None else lock_folder()
+    lock = partial(_lock_among_users, runtime_folder()) if shared is None else partial(_lock_file, shared, 0o660)
     stack = ExitStack()
     try:
         for place, device in sorted({address.place: address.device for address in wanted}.items()):
-            stack.enter_context(_lock(folder / _file_name(place), device, {**content, "place": place}))
+            stack.enter_context(lock(device, {**content, "place": place}))
     except BaseException:
         stack.close()
         raise
@@ -127,23 +132,39 @@ def _claimed(
 
 
 @contextmanager
-def _lock(path: Path, device: str, content: Mapping[str, object]) -> Generator[None]:
+def _lock_among_users(folder: Path, device: str, content: Mapping[str, object]) -> Generator[None]:
+    """The file in this user's folder, and the name that every user sees."""
     place = str(content["place"])
     with closing(socket.socket(socket.AF_UNIX)) as name:
         try:
             name.bind(f"\0thermostand {hashlib.sha256(place.encode()).hexdigest()}")
-            file = take(path, json.dumps(content).encode())
         except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise SessionError(f"{path}: cannot be locked ({error.strerror})") from error
-            file = None
-        if file is None:
-            named = place.partition(" in net:")[0]  # people do not know a network namespace by its number
-            raise InUse(device, f"{named} is in use by {_holder(path.name)}; nothing was touched")
-        try:
+            if error.errno == errno.EADDRINUSE:
+                raise _in_use(device, place) from error
+            raise SessionError(f"{place}: cannot be locked ({error.strerror})") from error
+        with _lock_file(folder, 0o600, device, content):
             yield
-        finally:
-            remove(path, file)
+
+
+@contextmanager
+def _lock_file(folder: Path, mode: int, device: str, content: Mapping[str, object]) -> Generator[None]:
+    place = str(content["place"])
+    path = folder / _file_name(place)
+    try:
+        file = take(path, json.dumps(content).encode(), mode)
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be locked ({error.strerror})") from error
+    if file is None:
+        raise _in_use(device, place)
+    try:
+        yield
+    finally:
+        remove(path, file)
+
+
+def _in_use(device: str, place: str) -> InUse:
+    named = place.partition(" in net:")[0]  # people do not know a network namespace by its number
+    return InUse(device, f"{named} is in use by {_holder(_file_name(place))}; nothing was touched")
 
 
 def _file_name(place: str) -> str:
@@ -155,7 +176,7 @@ def _file_name(place: str) -> str:
 def _holder(file_name: str) -> str:
     """Who has the lock, as words of the sentence; a process that is just taking it writes its name a moment later."""
     for _ in range(_HOLDER_TRIES):
-        for folder in runtime_folders():
+        for folder in (*runtime_folders(), STANDS_FOLDER):
             with suppress(OSError, ValueError, LookupError, TypeError):
                 return _described(folder / file_name)
         threading.Event().wait(_HOLDER_PAUSE_S)
@@ -166,7 +187,7 @@ def daemon_pid(config: StandConfig) -> int | None:
     """The process of the daemon that has any address of this stand; None when none has. May take a while, as
     `addresses`."""
     for address in addresses(config):
-        for folder in runtime_folders():
+        for folder in (*runtime_folders(), STANDS_FOLDER):
             with suppress(OSError, ValueError, LookupError, TypeError):
                 said = _said(folder / _file_name(address.place))
                 if not said["session"] and not said.get("command"):
