@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from foundation.items import Batch, Item
+from foundation.items import Batch, Event, Item
 from foundation.readings import Quality, Reading
+from foundation.repeats import RepeatLimit
 
 Subscriber = Callable[[Item], None]
 
@@ -13,10 +14,12 @@ Subscriber = Callable[[Item], None]
 class Hub:
     """Keeps the latest reading of each channel and hands each item to every subscriber, in order of subscription.
 
-    Subscribers must return at once (enqueue, count, compare); one that does slow work has a queue of its own.
+    Subscribers must return at once (enqueue, count, compare); one that does slow work has a queue of its own. limit: of
+    messages that repeat.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, limit: RepeatLimit | None = None) -> None:
+        self._limit = limit
         self._latest: dict[str, Reading] = {}
         self._known: dict[str, Reading] = {}
         self._good_ns: dict[str, int] = {}
@@ -39,6 +42,11 @@ class Hub:
                     self._known[reading.channel] = reading
                 if reading.quality is Quality.GOOD:
                     self._good_ns[reading.channel] = reading.time_ns
+        if self._limit is not None and isinstance(item, Event):
+            admitted = self._limit.admit(item)
+            if admitted is None:
+                return
+            item = admitted
         for subscriber in self._subscribers:
             subscriber(item)
 

@@ -74,6 +74,7 @@ class Permits:
         self._hub = hub
         self._clock = clock
         self._until_ns: dict[str, int] = {}  # when an armed relay drops unless it is armed again
+        self._came_on: set[str] = set()  # those that have read on since they were armed
         self._comparing = asyncio.Lock()  # what is compared must not be switched meanwhile, but for making safe
 
     @property
@@ -209,16 +210,23 @@ class Permits:
         now_ns = self._clock.now_ns()
         for channel in (HEATER, COMPRESSOR):
             until_ns = self._until_ns.get(channel, 0)
+            if coils.get(channel):
+                self._came_on.add(channel)
             if coils.get(channel) or not until_ns:
                 continue
             del self._until_ns[channel]
             early = until_ns - now_ns > seconds_ns(_EARLY_S)
+            came_on = channel in self._came_on
+            self._came_on.discard(channel)
             if channel == COMPRESSOR and self._compressor.running:
                 # One that was not renewed in time has dropped by itself: its rest began there.
                 self._set(
                     CompressorState(False, now_ns if early else min(now_ns, until_ns), self._compressor.starts_ns)
                 )
-            if early:
+            if early and not came_on:
+                text = f"{self.name}.{channel} does not come on: the board confirms its command and reads off"
+                self._tell(f"{channel}_not_on", text, channel)
+            elif early:
                 left_s = (until_ns - now_ns) / NS_PER_S
                 rest = "; it counts as a stop, and the compressor rests" if channel == COMPRESSOR else ""
                 text = f"{self.name}.{channel} is off {left_s:.1f} s before its time: something else switched it{rest}"

@@ -23,6 +23,7 @@ from stand.daemon.daemon_file import KeptFile, kept_in
 from stand.daemon.day_record import DayRecord
 from stand.daemon.orders import Orders
 from stand.daemon.reports import Reports
+from stand.message_limit import stand_hub
 from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
 from stand.running.opening.open_stand import opened
@@ -49,7 +50,7 @@ async def serve(
     StandTripped when the stand could not be confirmed safe at the end.
     """
     async with Stop() as stop, claimed(config, None):
-        hub, clock = Hub(), WallClock()
+        hub, clock = stand_hub(), WallClock()
         await asyncio.to_thread(out.mkdir, parents=True, exist_ok=True)
         kept = await asyncio.to_thread(kept_in, out)
         watch = ClockWatch(hub, clock)

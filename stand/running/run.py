@@ -20,6 +20,7 @@ from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recor
 from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly, assemble
 from stand.config.safe_ranges import accepted_text
+from stand.message_limit import stand_hub
 from stand.running.guest import Guest, Job
 from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
@@ -144,7 +145,7 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
     """The whole run; one on a real stand has it for itself from before anything is opened, or does not touch it."""
     directory = _directory(job, clock)
     async with claimed(job.order.config, directory) if isinstance(clock, WallClock) else nullcontext():
-        hub, early = Hub(), _Early()
+        hub, early = stand_hub(), _Early()
         job.watch(hub)
         hub.subscribe(early)
         if isinstance(clock, WallClock):

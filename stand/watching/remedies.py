@@ -18,6 +18,7 @@ _OF_REASON = {
 }
 _CONNECTED = "`stand devices` shows what is connected"
 _SEE_DISK = "see that the disk has room and answers"
+_NOT_ON = "look at the relay board, its supply and that channel: `stand check` tries each relay"
 _SWITCHED = "find what else switches it: a key of the unit, a second program on its line"
 _CLEAR_FOLDER = "have its disk mounted, or the folder moved back, then `stand clear`"
 _SENSOR = "compare it with another thermometer at its place, and look at its cable"
@@ -56,6 +57,8 @@ _OF_KIND = {
     "frames_stopped": _ROOM,
     "gap": _SHOW_SESSION,
     "guard_late": "see what stopped or loads this computer; " + _SLEEP,
+    "compressor_not_on": _NOT_ON,
+    "heater_enable_not_on": _NOT_ON,
     "heater_enable_dropped": "look at the relay board's supply; " + _SWITCHED,
     "held": "`stand status` says what holds it, and what ends that",
     "hold_ended": _NOTHING,

@@ -72,6 +72,20 @@ async def test_a_brown_out_of_the_board_drops_the_heater_and_it_is_permitted_aga
     await bench.end()
 
 
+async def test_a_heater_relay_that_does_not_come_on_again_is_said_as_such(bench: Bench):
+    await bench.start(26, 60)
+    await bench.fault("relays.lost_writes", True)
+    await bench.fault("relays.brown_out", True)
+    await bench.wait(14)
+    assert kinds(bench, "heater_enable_dropped", "heater_enable_not_on")[:2] == [
+        "heater_enable_dropped",
+        "heater_enable_not_on",
+    ]
+    assert len(kinds(bench, "heater_enable_dropped")) == 1
+    await bench.fault("relays.lost_writes", False)
+    await bench.end()
+
+
 async def test_permits_that_are_renewed_in_time_are_never_taken_for_dropped(bench: Bench):
     await bench.start(10, 3600)
     assert kinds(bench, "compressor_dropped", "heater_enable_dropped", "switched_off", "guard_late") == []
