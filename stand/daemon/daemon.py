@@ -28,11 +28,13 @@ from stand.daemon.daemon_file import Kept, KeptFile, Latch
 from stand.daemon.day_record import DayRecord
 from stand.daemon.orders import Orders
 from stand.fault import Fault
+from stand.gate import INTERLOCK
 from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
 from stand.running.opening.open_stand import OpenStand
 from stand.running.opening.stop import STOPPED, catch_signals
+from stand.running.opening.writer_restarts import WriterRestarts
 from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 
@@ -70,6 +72,7 @@ class Daemon:
         self._hands: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
         self._others: set[asyncio.Task[None]] = set()
         self._extending: list[asyncio.Task[None]] = []
+        self._restarts, self._run_id = WriterRestarts(), 0  # after which run that had the stand last
         self._recorded_ns = self._turned_ns = 0  # when a record was last begun, or that of a new day, or could not be
         hub.subscribe(self._follow)
 
@@ -223,10 +226,31 @@ class Daemon:
                 self._tell("info", "queue_empty", "all that was queued is done")
             except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
                 self._say(f"the queue is halted: {failure_text(error)}")
+                await self._restart_recording()
             finally:
                 self._is_draining = False
             with suppress(SessionError):
                 await self.orders.read()
+
+    async def _restart_recording(self) -> None:
+        """What an operator would do after the process that writes a run's session was killed: clear, and resume."""
+        if self.orders.leaving or self._assembly.stand.safety.unconfirmed:
+            return
+        if not self._restarts.may_follow(self.open_stand.latched, self._clock.now_ns()):
+            return
+        self._assembly.stand.gate.clear(INTERLOCK)
+        self.note()
+        if self.open_stand.latched is not None:  # something else is wrong, too
+            return
+        try:
+            await self.orders.read()
+            session = next(entry.session for entry in self.orders.queued.entries if entry.id == self._run_id)
+            await self.orders.resume(session)
+        except StandError as error:
+            self._tell("error", "not_resumed", f"run {self._run_id} is not resumed by itself: {error}")
+            return
+        self._tell("warning", "recording_restarted", f"{session}: its writer was killed; the run is resumed")
+        self.wake()
 
     async def _run_one(self, entry: Entry, notes: Notes) -> Path:
         if self.orders.leaving:
@@ -234,6 +258,7 @@ class Daemon:
         if self.open_stand.latched is not None:
             raise StandTripped(f"the stand has tripped: {self.open_stand.latched.text}")
         has_begun = False
+        self._run_id = entry.id
 
         def begun() -> None:
             nonlocal has_begun

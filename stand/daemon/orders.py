@@ -133,6 +133,11 @@ class Orders:
             raise Conflict(str(error)) from error
         if is_whole:
             raise Conflict(f"{session}: its run is complete; there is nothing to resume")
+        # A session whose process was killed has no finished segment yet, and cannot be opened.
+        try:
+            await self.repair.call(repaired, folder)
+        except SessionError as error:
+            raise Conflict(str(error)) from error
         order = await self.reading.call(self._recorded, session)
         now_ns = self._open_stand.assembly.clock.now_ns()
         wanted = queue.entry_of(order, self._config_name, now_ns)

@@ -11,6 +11,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.readings import Quality
 from stand.fault import Action, Fault, Readings, value_of
 
+RECORDING_ENDED = "recording_ended"  # the rule after which a run is resumed by itself (writer_restarts.py)
 NOT_DURABLE = "not_recorded"  # the rule that ends its hold when the disk has caught up
 _CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to clear that
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
@@ -311,6 +312,6 @@ def recording_ended(recording: Recording) -> Rule:
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         ended = recording.writer_ended
-        return Fault("recording_ended", f"{ended}; nothing is recorded any more") if ended else None
+        return Fault(RECORDING_ENDED, f"{ended}; nothing is recorded any more") if ended else None
 
     return rule

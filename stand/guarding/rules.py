@@ -300,7 +300,7 @@ def _contacts(config: StandConfig) -> tuple[Watch, ...]:
 
 def recorded(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
     """Heat only while it is recorded. A disk that hangs or refuses may work again by itself; a folder that was moved
-    does not come back by itself. A run whose writer was killed has ended: `stand resume` continues it."""
+    does not come back by itself. A run whose writer was killed is ended, and resumed by itself (writer_restarts.py)."""
     return (
         Watch(recording_ended(recording)),
         Watch(folder_lost(recording), action="hold"),

@@ -164,9 +164,9 @@ def put_first(directory: Path, entry: Entry, session: str) -> Entry:
     queue is cleared: an operator has asked for this."""
     with changing(directory) as draft:
         found = next((each for each in reversed(draft.queue.entries) if each.session == session), None)
-        known = {"id": draft.queue.next_id, "began_ns": entry.added_ns}
+        known: dict[str, object] = {"id": draft.queue.next_id, "began_ns": entry.added_ns}
         if found is not None:
-            known = {"id": found.id, "added_ns": found.added_ns, "began_ns": found.began_ns}
+            known = {"id": found.id, "added_ns": found.added_ns, "began_ns": found.began_ns, "attended": found.attended}
         entry = entry.model_copy(update={**known, "state": State.INTERRUPTED, "session": session})
         rest = [each for each in draft.queue.entries if each.id != entry.id]
         ended, waiting = [e for e in rest if not e.is_open], [e for e in rest if e.is_open]

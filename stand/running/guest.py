@@ -285,7 +285,7 @@ class Guest:
         lasted = duration(now_ns - before.last_ns)
         log.tell("warning", "gap", f"until now nothing was recorded and nobody watched the stand, for {lasted}", data)
         if before.state.tripped:
-            log.tell("warning", "cleared", f"an operator cleared: {before.state.tripped}")
+            log.tell("warning", "cleared", f"cleared before it was resumed: {before.state.tripped}")
         version = importlib.metadata.version("thermostand")
         done = f"{len(before.kept.done)} steps are done"
         text = f"recipe {before.order.recipe.name} is resumed, {done}; thermostand {version}"

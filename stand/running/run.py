@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
@@ -28,9 +29,10 @@ from stand.running.opening.one_cpu import one_cpu
 from stand.running.opening.open_stand import OpenStand, Time, opened
 from stand.running.opening.stop import Stop
 from stand.running.opening.temperature_check import check_temperature
+from stand.running.opening.writer_restarts import WriterRestarts
 from stand.running.order import Order
 from stand.running.rehearsal import rehearsed
-from stand.running.resume import Interruption, is_of_virtual_time
+from stand.running.resume import Interruption, interruption, is_of_virtual_time
 from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory, tell_identities
 from stand.serving.alerts import alerting
 from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
@@ -68,8 +70,7 @@ async def run_real(
     order: Order, out: Path, watch: Callable[[Hub], None], begun: Callable[[Path], Awaitable[None]] = _nobody
 ) -> Path:
     """Run on the host's clock, against the devices at the configured addresses; else as run_virtual."""
-    async with Stop() as stop:
-        return await _run(Job(order, out, None, watch, begun), WallClock(), None, stop)
+    return await _kept_on(Job(order, out, None, watch, begun), WallClock())
 
 
 async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0) -> Path:
@@ -83,10 +84,38 @@ async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s:
         job = Job(before.order, before.directory.parent, before.seed, watch, _nobody, before)
         if is_of_virtual_time(before):
             return await _run_virtual(job, before.last_ns + seconds_ns(downtime_s))
-        async with Stop() as stop:
-            return await _run(job, WallClock(before.last_ns + 1), None, stop)
+        return await _kept_on(job, WallClock(before.last_ns + 1))
     finally:
         before.release()
+
+
+async def _kept_on(job: Job, clock: WallClock) -> Path:
+    """Run on the host's clock. When the process that writes the session is killed, the stand is made safe and closed,
+    and the run resumed with another one."""
+    restarts, directory = WriterRestarts(), None if job.before is None else job.before.directory
+    told = job.begun
+
+    async def begun(folder: Path) -> None:
+        nonlocal directory
+        directory = folder
+        await told(folder)
+
+    job = replace(job, begun=begun)
+    while True:
+        stop = Stop()
+        try:
+            async with stop:
+                return await _run(job, clock, None, stop)
+        except StandTripped:
+            if directory is None or stop.is_unsafe or not restarts.may_follow(stop.fault, clock.now_ns()):
+                raise
+        finally:
+            if job.before is not None:
+                job.before.release()
+        before = await asyncio.to_thread(partial(interruption, directory, job.order.config, clear=True))
+        order = replace(before.order, attended=job.order.attended)
+        before = replace(before, order=order)
+        job, clock = replace(job, order=order, before=before, begun=_nobody), WallClock(before.last_ns + 1)
 
 
 async def run_in(open_stand: OpenStand, job: Job, stop: Stop) -> Path:

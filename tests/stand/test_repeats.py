@@ -1,4 +1,4 @@
-"""A message that repeats is published at most six times an hour, with those between counted; what counts is not limited."""
+"""A message that repeats is published at most six times an hour, with those between counted, but for what counts."""
 
 import pytest
 
@@ -32,7 +32,9 @@ def test_after_a_quiet_hour_it_is_a_new_message():
     assert len(published("heater_enable_dropped", 3600.0, 30)) == 30
 
 
-@pytest.mark.parametrize(("kind", "data"), [("device_lost", {}), ("guard.heater_off", {"action": "hold"}), ("held", {})])
+@pytest.mark.parametrize(
+    ("kind", "data"), [("device_lost", {}), ("guard.heater_off", {"action": "hold"}), ("held", {})]
+)
 def test_what_begins_or_ends_a_state_is_always_published(kind: str, data: dict[str, object]):
     assert len(published(kind, 5.0, 100, data)) == 100
 

@@ -14,6 +14,7 @@ import pytest
 
 from foundation.errors import SessionError
 from recording.writing.disk import MODULE
+from stand.running.opening.writer_restarts import MOST_PER_H
 from stand.running.order import Order
 from stand.serving.desk import StandState
 from tests.recording.disks import ext4, run
@@ -136,3 +137,28 @@ def test_a_hung_disk_holds_the_stand_over_a_stop_of_the_process_and_keeps_nobody
     assert "the stand is held no longer" not in reported  # the disk still hangs
     assert "the recording ended while the disk held it up" in reported
     assert "the queue does not know it yet" in reported
+
+
+@pytest.mark.usefixtures("own_helpers")
+def test_a_served_run_whose_disk_process_is_killed_is_resumed_by_itself_and_by_an_operator(served: Served):
+    """By itself three times in an hour; then it is an operator's, who clears and resumes: what was written is repaired
+    first, though no segment of it was ever finished."""
+    served.until(is_idle)
+    served.submit(SOAK)
+
+    def is_heating(state: StandState) -> bool:
+        return state.run is not None and state.readings["relays.heater_enable"].value == 1
+
+    for again in range(MOST_PER_H + 1):
+        served.until(is_heating)
+        os.kill(disk_processes(served)[-1], signal.SIGKILL)
+        served.until(lambda state: state.readings["relays.heater_enable"].value == 0)
+        if again < MOST_PER_H:
+            served.until(lambda state: state.run is not None and state.fault is None)
+    ended = served.until(lambda state: state.phase == "idle" and [run.state for run in state.queue] == ["failed"])
+    assert ended.fault is not None
+    served.post("run/clear")
+    served.post(f"sessions/{ended.queue[0].session}/resume")
+    served.until(is_heating)
+    served.post("run/stop")
+    served.until(lambda state: state.run is None)

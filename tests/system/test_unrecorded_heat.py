@@ -16,6 +16,7 @@ from foundation.errors import StandError, StandTripped
 from recording.reading.session import Session
 from recording.repair.salvage import salvage_session
 from recording.writing.disk import MODULE
+from stand.running.opening.writer_restarts import MOST_PER_H
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import run_real
@@ -147,12 +148,20 @@ def disk_process() -> int:
 
 
 @pytest.mark.usefixtures("own_helpers")
-async def test_a_run_whose_disk_process_was_killed_ends_safe_with_all_that_was_acknowledged(
+async def test_a_run_whose_disk_process_is_killed_goes_on_with_another_until_it_is_killed_too_often(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
+    """Safe each time, and with all that was acknowledged."""
     ordered = order(SOAK, **FAST)
     await asyncio.to_thread(simulator, ordered.config, False)
     async with heating(ordered, tmp_path / "out") as (task, watcher):
+        for _ in range(MOST_PER_H):
+            watcher.events.clear()
+            os.kill(disk_process(), signal.SIGKILL)
+            await happens(watcher, "guard.recording_ended")
+            await happens(watcher, "restored")
+            await heater_is(ordered, 1)
+        watcher.events.clear()
         os.kill(disk_process(), signal.SIGKILL)
         with pytest.raises(StandTripped, match=r"writes the session to the disk has ended.*; the stand is safe"):
             await asyncio.wait_for(task, LIMIT_S)
@@ -164,6 +173,8 @@ async def test_a_run_whose_disk_process_was_killed_ends_safe_with_all_that_was_a
     before = interruption(directory)
     before.release()
     assert before.state.done or before.state.earned_s
+    begun = [event.kind for event in Session.open(directory).events() if event.kind in ("run.start", "run.resume")]
+    assert begun == ["run.start", *["run.resume"] * MOST_PER_H]
 
 
 @pytest.mark.parametrize("how", ["removed", pytest.param("renamed", marks=pytest.mark.nightly)])

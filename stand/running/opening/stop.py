@@ -39,6 +39,11 @@ class Stop:
         if has_signals and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             self._signals.append(signal.SIGHUP)
 
+    @property
+    def is_unsafe(self) -> bool:
+        """Whether an actuator of the stand has not confirmed its safe state."""
+        return self._stand is not None and bool(self._stand.safety.unconfirmed)
+
     def watch(self, stand: Stand) -> None:
         """The stand to be made safe; before that a stop only cancels."""
         self._stand = stand
