@@ -79,11 +79,22 @@ def _out_of_place(step: Step, before: _Before) -> str:
             return "the camera is on here; give power_camera: off before it"
         case Capture() | SoakUntilSettled() if not before.camera_on:
             return "the camera is off here; give power_camera: on before it"
+        case SoakUntilSettled() if before.degC is None:
+            return "the chamber has no set-point here; give start_chamber before it"
+        case Capture(role=Role.SETTLING):
+            return "role settling is kept for the looks of a soak until settled; give another one"
+        case SoakUntilSettled(role=role) if role is not Role.SETTLING:
+            return f"the looks of a soak until settled have the role settling, not {role}"
         case Capture(role=role) if not before.flap_open and role is not Role.OTHER:
             return f"the flap is closed here, and {role} frames show the target; give open_flap before it"
         case _ if isinstance(step, AnySoak) and before.flap_open and longest_s(step) > _OPEN_S:
             return (
                 f"the flap is open here, and the laboratory's air comes in for {longest_s(step):g} s; give close_flap"
+            )
+        case Capture() | SoakUntilSettled() if before.degC is not None and step.chamber_degC != before.degC:
+            return (
+                f"chamber_degC is {step.chamber_degC:g}, and the set-point of the steps before {before.degC:g} degC; "
+                "leave chamber_degC out, or set that temperature before"
             )
         case _:
             return ""

@@ -12,9 +12,9 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from foundation.errors import ConfigError
 
@@ -36,6 +36,11 @@ class Role(StrEnum):
     REPEATABILITY = "repeatability"
     SETTLING = "settling"
     OTHER = "other"
+
+
+_BY_THE_PLAN = Field(json_schema_extra={"readOnly": True})  # nobody types what follows from the steps before
+SetPoint_degC = Annotated[float, _BY_THE_PLAN]
+"""Of frames: the set-point that the steps before have given the chamber."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +86,8 @@ class SoakUntilSettled:
     camera_K_per_min: float
     drift_px_per_min: float
     exposure_s: float
-    chamber_degC: float
-    role: Role = Role.SETTLING
+    chamber_degC: SetPoint_degC
+    role: Annotated[Role, _BY_THE_PLAN] = Role.SETTLING
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,14 +102,15 @@ class CloseFlap:
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """`frames` images, one every `interval_s`, each exposed for `exposure_s`; `chamber_degC` labels the set-point.
+    """`frames` images, one every `interval_s`, each exposed for `exposure_s`. `chamber_degC`: the set-point
+    of the steps before; of a chamber that is stopped, the temperature that the recipe states.
     `cameras`: the names of those that expose, none for all of the stand."""
 
     frames: int
     interval_s: float
     exposure_s: float
     role: Role
-    chamber_degC: float
+    chamber_degC: SetPoint_degC
     cameras: tuple[str, ...] = ()
 
 
@@ -173,15 +179,15 @@ class Decide:
     warmest_degC: float
     dwells_s: tuple[float, ...]
     ramp_K_per_min: float
-    left_s: float
-    visits: int
+    left_s: Annotated[float, _BY_THE_PLAN]
+    visits: Annotated[int, _BY_THE_PLAN]
     wait_s: float
     frames: int
     interval_s: float
     exposure_s: float
     set_points_degC: tuple[float, ...] = ()
     held_out_degC: tuple[float, ...] = ()
-    unvalidated_degC: tuple[float, ...] = ()
+    unvalidated_degC: Annotated[tuple[float, ...], _BY_THE_PLAN] = ()
     states: tuple[WantedState, ...] = WANTED_STATES
 
 
@@ -285,8 +291,12 @@ def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
 
 
 def schema_of_steps() -> dict[str, object]:
-    """The JSON Schema of any step's parameters, with a definition for each kind, by its name."""
-    return TypeAdapter(Step).json_schema()
+    """The JSON Schema of any step's parameters, with a definition for each kind, by its name. readOnly: what follows
+    from the plan; `chamber_degC` of frames need not be given."""
+    schema = TypeAdapter(Step).json_schema()
+    for kind in (Capture, SoakUntilSettled):
+        schema["$defs"][kind.__name__]["required"].remove("chamber_degC")
+    return schema
 
 
 @dataclass(frozen=True, slots=True)

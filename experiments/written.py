@@ -57,8 +57,8 @@ class Nothing(Document):
 
 class CaptureEntry(CaptureParameters):
     """`frames` images. role: what they are for; `other` frames are recorded and shown, and nothing is fitted to them.
-    chamber_degC: the set-point they are made at, by default that of the steps before. cameras: the names of those that
-    expose, by default all of the stand."""
+    chamber_degC: only while the chamber is stopped, the temperature they are made at; else it is the set-point of the
+    steps before. cameras: the names of those that expose, by default all of the stand."""
 
     frames: FrameCount = 1
     role: Role = Role.OTHER

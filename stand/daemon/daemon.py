@@ -129,9 +129,9 @@ class Daemon:
     def refused_by_hand(self) -> str:
         """Why no device takes an order now, "" when they do."""
         if self.has_guest:
-            return "a run has the stand; `stand stop` ends it"
+            return "a run has the stand; STOP ends it"
         if self.open_stand.latched is not None:
-            return f"the stand has tripped: {self.open_stand.latched.text}; `stand clear` once the cause is removed"
+            return f"the stand has tripped: {self.open_stand.latched.text}; clear it once the cause is removed"
         reasons = self._assembly.stand.gate.reasons
         return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
 

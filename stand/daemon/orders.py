@@ -180,7 +180,7 @@ class Orders:
             if self.leaving:
                 raise
             follows = any(each.is_open for each in self.queued.entries)
-            clear = "; `stand clear` lets the next of the queue begin" if follows else ""
+            clear = "; the next of the queue begins when the stand is cleared" if follows else ""
             raise Stopped(f"{error}; it may be resumed{clear}", halts=follows) from error
         finally:
             self.stop = None

@@ -41,6 +41,7 @@ class Eta:
         earned_s: Mapping[str, float] = MappingProxyType({}),
         after_s: float = 0.0,
     ) -> None:
+        self._expected_s = {step.planned.step_id: step.duration_s for step in steps}  # with what it has earned
         self._steps = [_owed(step, earned_s.get(step.planned.step_id, 0.0)) for step in steps]
         self._waiting = {step.planned.index: step for step in self._steps if step.planned.step_id not in done}
         self._first = min(self._waiting, default=0)
@@ -83,6 +84,23 @@ class Eta:
         """How many frames the plan is expected to give now."""
         return sum(step.frames for step in self._steps)
 
+    def expected_s(self, step_id: str) -> float:
+        """What a step of the plan is expected to take, or was, from its beginning to its end, s."""
+        return self._expected_s[step_id]
+
+    def ends_s(self, now_ns: int) -> dict[str, float]:
+        """From `now_ns` until each step that is under way or to come is expected to be done, s, by its id: what follows
+        the last one is what `left_s` has besides."""
+        ends: dict[str, float] = {}
+        at_s = 0.0
+        if self._running is not None:
+            at_s = max(0.0, self._from_now_s(self._running) - self._progress_s(now_ns))
+            ends[self._running.planned.step_id] = at_s
+        for _, step in sorted(self._waiting.items()):
+            at_s += self._from_now_s(step)
+            ends[step.planned.step_id] = at_s
+        return ends
+
     def within_s(self) -> float | None:
         """By how much the plan may end earlier or later, s: twice the deviation of the steps so far from what was
         expected of each, for as many of their kind of work as are to come; no less than a minute. None before three
@@ -119,8 +137,7 @@ class Eta:
         """From `now_ns` until the plan and what follows it are done, s; a pause under way is taken to end now."""
         left_s = self._stated_s + sum(count * self._overhead_s[work] for work, count in self._count.items())
         if self._running is not None:
-            expected_s = self._running.stated_s + self._overhead_s[self._running.work]
-            left_s += max(0.0, expected_s - self._progress_s(now_ns))
+            left_s += max(0.0, self._from_now_s(self._running) - self._progress_s(now_ns))
         gone_s = 0.0 if self._after_since_ns < 0 else (now_ns - self._after_since_ns) / NS_PER_S
         return max(0.0, left_s) + max(0.0, self._after_s - gone_s)
 
@@ -137,6 +154,7 @@ class Eta:
                 self._overhead_s.setdefault(work, 0.0)
                 self._seen_s.setdefault(work, deque([0.0], _REMEMBERED))
                 self._steps.append(PricedStep(planned, stated_s, frames_of(planned.step), 0.0, work, stated_s))
+                self._expected_s[planned.step_id] = stated_s
                 self._wait_for(planned.index)
             return
         found = (step.planned.index for step in self._steps if step.planned.step_id == data.get("step_id"))
@@ -144,11 +162,16 @@ class Eta:
         for index in found:
             step, is_waiting = self._steps[index], self._forget(index)
             if isinstance(by_s, int | float):
+                self._expected_s[step.planned.step_id] += by_s
                 self._steps[index] = replace(step, stated_s=step.stated_s + by_s, duration_s=step.duration_s + by_s)
                 if is_waiting:
                     self._wait_for(index)
             if self._running is step:
                 self._running = self._steps[index] if isinstance(by_s, int | float) else None
+
+    def _from_now_s(self, step: PricedStep) -> float:
+        """What a step that begins now is expected to take."""
+        return step.stated_s + self._overhead_s[step.work]
 
     def _wait_for(self, index: int) -> None:
         self._waiting[index] = step = self._steps[index]

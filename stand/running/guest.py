@@ -238,7 +238,7 @@ class Guest:
             board.status,
             lambda: open_stand.latched,
             notes,
-            board.priced_s,
+            board.eta,
         )
         assembly.hub.subscribe(desk)
         leaving.callback(assembly.hub.unsubscribe, desk)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from experiments.steps import Step, step_of
+from experiments.steps import PlannedStep, Step, step_of
 from experiments.words import in_words
+from experiments.written import set_point_after
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
 from stand.estimating.estimate import price
@@ -16,31 +17,54 @@ from stand.running.order import plan_faults
 from stand.serving.desk import WrittenStep
 from stand.serving.plan_faults import PlanCheck, StepFault
 
+_SET_POINT = "chamber_degC"
+_LABELLED = ("Capture", "SoakUntilSettled")  # with the set-point that the steps before have given the chamber
+
+
+def steps_of(
+    plan: Sequence[PlannedStep], from_index: int, steps: Sequence[WrittenStep]
+) -> Iterator[tuple[Step | ConfigError, float | None]]:
+    """Each of the steps that are to follow the first `from_index` of the plan, or what is wrong with it; and the
+    chamber's set-point there, None while it is stopped. Frames that are not said to be at one are at that."""
+    at_degC: float | None = None
+    for planned in plan[:from_index]:
+        at_degC = set_point_after(planned.step, at_degC)
+    for written in steps:
+        here_degC, parameters = at_degC, dict[str, object](written.parameters)
+        if written.kind in _LABELLED and parameters.get(_SET_POINT) is None and at_degC is not None:
+            parameters[_SET_POINT] = at_degC
+        try:
+            step = step_of(written.kind, parameters)
+        except ConfigError as error:
+            yield error, here_degC
+        else:
+            at_degC = set_point_after(step, at_degC)
+            yield step, here_degC
+
 
 def check_edit(state: RunState, from_index: int, steps: Sequence[WrittenStep], config: StandConfig) -> PlanCheck:
     """What an edit of the plan from `from_index` on would say. Changes nothing, and asks no device."""
-    by, faults = list[Step](), list[StepFault]()
-    texts: list[str] = []
-    for index, written in enumerate(steps, from_index):
-        try:
-            step = step_of(written.kind, dict(written.parameters))
-        except ConfigError as error:
-            faults.append(StepFault(index=index, text=str(error)))
-            texts.append("")
-        else:
-            by.append(step)
-            texts.append(in_words(step))
-    if faults:  # the others cannot be judged: what stands before them is not known
-        return PlanCheck(faults=tuple(faults), texts=tuple(texts))
+    found = list(steps_of(state.plan, from_index, steps))
+    seen = PlanCheck(
+        texts=tuple("" if isinstance(step, ConfigError) else in_words(step) for step, _ in found),
+        set_points_degC=tuple(degC for _, degC in found),
+    )
+    by = [step for step, _ in found if not isinstance(step, ConfigError)]
+    wrong = [(index, step) for index, (step, _) in enumerate(found, from_index) if isinstance(step, ConfigError)]
+    if wrong:  # the others cannot be judged: what stands before them is not known
+        return _with_faults(seen, [(index, str(error)) for index, error in wrong])
     change = edited(0, from_index, by)
     if reason := refusal(state, change):
-        return PlanCheck(faults=(StepFault(index=None, text=reason),), texts=tuple(texts))
+        return _with_faults(seen, [(None, reason)])
     plan = after(state, change).plan
-    faults = [StepFault(index=index, text=text) for index, text in plan_faults(plan, config)]
-    if faults:
-        return PlanCheck(faults=tuple(faults), texts=tuple(texts))
+    if faults := list(plan_faults(plan, config)):
+        return _with_faults(seen, faults)
     try:
         priced = price(plan, config)
     except ConfigError as error:
-        return PlanCheck(faults=(StepFault(index=None, text=str(error)),), texts=tuple(texts))
-    return PlanCheck(duration_s=sum(each.duration_s for each in priced[from_index:]), texts=tuple(texts))
+        return _with_faults(seen, [(None, str(error))])
+    return seen.model_copy(update={"duration_s": sum(each.duration_s for each in priced[from_index:])})
+
+
+def _with_faults(seen: PlanCheck, faults: Sequence[tuple[int | None, str]]) -> PlanCheck:
+    return seen.model_copy(update={"faults": tuple(StepFault(index=index, text=text) for index, text in faults)})

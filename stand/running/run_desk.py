@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import JsonValue
 
-from experiments.steps import PlannedStep, estimate_s, frames_of, kind_of, parameters_of, step_of
+from experiments.steps import PlannedStep, Step, frames_of, kind_of, parameters_of
 from experiments.words import in_words
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError, SessionError
 from foundation.items import Event, Item, StepMark, StepState
 from recording.writing.disk import DiskCalls
 from stand.assembly import Assembly, device_kinds
+from stand.estimating.eta import Eta
 from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR, Phase
 from stand.running.executing.executor import Executor
 from stand.running.memory.journal import Logbook
 from stand.running.memory.state import RunState
 from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
-from stand.running.plan_check import check_edit
+from stand.running.plan_check import check_edit, steps_of
 from stand.running.said import Said, keep
 from stand.running.simulated_faults import break_or_mend, simulated_faults
 from stand.running.status import STATES
@@ -57,8 +58,8 @@ _ENDING = (Phase.ABORTING, Phase.ENDING, Phase.ENDED)
 class RunDesk:
     """The desk of a run (stand/serving/desk.py has what each method does). A subscriber of the hub.
 
-    session: its folder. status: the published state of the run. latched: why the guard holds the stand. duration_s:
-    expected of the steps that were planned, by their ids. notes: where the session's file of notes is written.
+    session: its folder. status: the published state of the run. latched: why the guard holds the stand. notes: where
+    the session's file of notes is written. eta: what the steps are expected to take, the same as the run's end is from.
     """
 
     assembly: Assembly
@@ -69,7 +70,7 @@ class RunDesk:
     status: Callable[[], RunStatus]
     latched: Callable[[], Fault | None]
     notes: DiskCalls
-    duration_s: Mapping[str, float] = field(default_factory=dict[str, float])
+    eta: Eta
 
     def __post_init__(self) -> None:
         self._pausing = False
@@ -112,16 +113,8 @@ class RunDesk:
     def plan(self) -> tuple[PlanStep, ...]:
         """The plan in force; of what is to come, when it is expected to be done."""
         state, now_ns = self.log.state, self.assembly.clock.now_ns()
-        began_ns, ended_ns, due_ns = dict(self._began_ns), dict(self._ended_ns), now_ns
-        steps: list[PlanStep] = []
-        for planned in state.plan:
-            step = self._plan_step(state, planned, began_ns, ended_ns)
-            if step.standing in ("waiting", "under_way"):
-                gone_ns = now_ns - (step.began_ns or now_ns) if step.standing == "under_way" else 0
-                due_ns += max(0, seconds_ns(step.duration_s) - gone_ns)
-                step = step.model_copy(update={"expected_ns": due_ns})
-            steps.append(step)
-        return tuple(steps)
+        ends_ns = {step_id: now_ns + seconds_ns(end_s) for step_id, end_s in self.eta.ends_s(now_ns).items()}
+        return tuple(self._plan_step(state, planned, ends_ns) for planned in state.plan)
 
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
         """What an edit would say."""
@@ -177,7 +170,7 @@ class RunDesk:
     async def edit(self, who: Who, from_index: int, steps: Sequence[WrittenStep]) -> Done:
         """Replace the steps from a place on."""
         self._check_running()
-        by = [step_of(step.kind, dict(step.parameters)) for step in steps]
+        by = [_checked(step) for step, _ in steps_of(self.log.state.plan, from_index, steps)]
         await self.executor.edit(from_index, by)
         data: dict[str, JsonValue] = {"from_index": from_index, "steps": len(by)}
         return self._done(
@@ -204,7 +197,7 @@ class RunDesk:
         """Conflict: the run has the stand."""
         if name not in (kinds := device_kinds(self.assembly.config)):
             raise Missing(f"this stand has no device of that name; there are {', '.join(kinds)}")
-        raise Conflict("a run has the stand; pause does not change that, `stand stop` ends the run")
+        raise Conflict("a run has the stand; pause does not change that, STOP ends the run")
 
     async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
         """Of the session of this run."""
@@ -246,12 +239,10 @@ class RunDesk:
             self._fault = fault, self.assembly.clock.now_ns()
         return FaultState(rule=fault.rule, text=fault.text, since_ns=self._fault[1], data=fault.data)
 
-    def _plan_step(
-        self, state: RunState, planned: PlannedStep, began_ns: Mapping[str, int], ended_ns: Mapping[str, int]
-    ) -> PlanStep:
+    def _plan_step(self, state: RunState, planned: PlannedStep, ends_ns: Mapping[str, int]) -> PlanStep:
         step_id, step = planned.step_id, planned.step
         standing = _standing(state, step_id)
-        duration_s, frames = self.duration_s.get(step_id, estimate_s(step, 0.0)), frames_of(step)
+        frames, is_to_come = frames_of(step), standing in ("waiting", "under_way")
         earned_s = state.earned_ns.get(step_id, 0) / NS_PER_S
         return PlanStep.model_construct(
             step_id=step_id,
@@ -260,17 +251,23 @@ class RunDesk:
             parameters=parameters_of(step),
             text=in_words(step),
             standing=standing,
-            duration_s=duration_s,
+            duration_s=self.eta.expected_s(step_id),
             earned_s=earned_s,
             frames=frames,
             frames_saved=frames if standing == "done" else state.frames.get(step_id, 0),
-            began_ns=began_ns.get(step_id),
-            ended_ns=ended_ns.get(step_id),
-            expected_ns=None,
+            began_ns=self._began_ns.get(step_id),
+            ended_ns=self._ended_ns.get(step_id),
+            expected_ns=ends_ns.get(step_id) if is_to_come else None,
         )
 
     def _channels(self, name: str) -> tuple[str, ...]:
         return tuple(channel for channel in self.assembly.hub.readings if channel.startswith(f"{name}."))
+
+
+def _checked(step: Step | ConfigError) -> Step:
+    if isinstance(step, ConfigError):
+        raise step
+    return step
 
 
 async def _changed(change: Coroutine[None, None, None]) -> None:

@@ -32,8 +32,8 @@ STATES: dict[Phase, State] = {
 class StatusBoard:
     """A subscriber of the hub that remembers what an operator asks for. `held` gives why the guard holds the run.
 
-    priced_s: what each step was expected to take before the run, by its id. soaked_again_s: for how long a camera
-    that was off has been soaked again, None when it need not be.
+    eta: the time left, of the whole and of each step. soaked_again_s: for how long a camera that was off has been
+    soaked again, None when it need not be.
     """
 
     def __init__(
@@ -48,10 +48,9 @@ class StatusBoard:
         clock: Clock,
         soaked_again_s: Callable[[], float | None] = lambda: None,
     ) -> None:
-        self.priced_s = {step.planned.step_id: step.duration_s for step in night.steps}
         self._recipe = recipe
         self._soaked_again_s = soaked_again_s
-        self._eta = Eta(night.steps, state.done, state.earned_s, night.after_s)
+        self.eta = Eta(night.steps, state.done, state.earned_s, night.after_s)
         self._gate = gate
         self._stop = stop
         self._held = held
@@ -70,11 +69,11 @@ class StatusBoard:
         self._follow_state()
         match item:
             case StepMark():
-                self._eta.mark(item)
+                self.eta.mark(item)
                 self._step = item.index + 1
                 self._doing = mark_in_words(item.kind, item.parameters)
             case Event():
-                self._eta.event(item)
+                self.eta.event(item)
                 if item.level != "info":
                     self._warning, self._warning_utc_offset_ns = item, utc_offset_ns(self._clock)
             case Batch():
@@ -93,15 +92,15 @@ class StatusBoard:
         return RunStatus(
             recipe=self._recipe,
             step=self._step,
-            steps=self._eta.count,
+            steps=self.eta.count,
             doing=self._doing_now(),
             state=self._state,
             reasons=tuple(sorted(self._gate.reasons)),
             now_ns=now_ns,
             since_ns=self._since_ns,
-            end_ns=None if self._state == "stopping" else now_ns + seconds_ns(self._eta.left_s(now_ns)),
-            end_within_s=self._eta.within_s(),
-            frames_planned=self._eta.frames,
+            end_ns=None if self._state == "stopping" else now_ns + seconds_ns(self.eta.left_s(now_ns)),
+            end_within_s=self.eta.within_s(),
+            frames_planned=self.eta.frames,
             temperatures_degC=self._temperatures_degC,
             frames_saved=saved.frames,
             frames_lost=saved.frames_lost,
@@ -126,7 +125,7 @@ class StatusBoard:
 
     def left_s(self, now_ns: int) -> float:
         """How long the run still takes, from now on."""
-        return self._eta.left_s(now_ns)
+        return self.eta.left_s(now_ns)
 
     def _fault(self) -> Fault | None:
         """What has tripped; an operator who stops the run is no fault."""

@@ -37,7 +37,8 @@ Times = NDArray[np.int64]
 @dataclass(frozen=True, slots=True)
 class Mark:
     """An event, or a step: then `level` is "step", `kind` and `text` are the step's, and end_ns is None while it is
-    under way."""
+    under way. Or `level` is "reference": from then on the drift of the camera `kind` counts from another frame, and is
+    not to be compared with that before."""
 
     time_ns: int
     level: str
@@ -179,6 +180,7 @@ class History:
         self._infos: deque[Mark] = deque(maxlen=MOST_MARKS)  # so many of what is only worth knowing
         self._warned: deque[Mark] = deque(maxlen=MOST_MARKS)  # and so many of what is more
         self._steps: deque[Mark] = deque(maxlen=MOST_MARKS)
+        self._references: deque[Mark] = deque(maxlen=MOST_MARKS)
         self._last_ns: dict[str, int] = {}
 
     def __call__(self, item: Item) -> None:
@@ -229,6 +231,7 @@ class History:
             (self._infos, other._infos),
             (self._warned, other._warned),
             (self._steps, other._steps),
+            (self._references, other._references),
         ):
             own = tuple(marks)
             marks.clear()
@@ -248,6 +251,10 @@ class History:
             if step.step_id == item.step_id and step.end_ns is None:
                 self._steps[index] = Mark(step.time_ns, "step", step.kind, step.text, step.step_id, item.time_ns)
                 return
+
+    def reference(self, camera: str, time_ns: int) -> None:
+        """From then on the drift of this camera counts from another frame."""
+        self._references.append(Mark(time_ns, "reference", camera, ""))
 
     def columns(self, from_ns: int, to_ns: int, points: int = 1200, channels: Collection[str] | None = None) -> Columns:
         """Curves from `from_ns` to `to_ns` in at most `points` columns; ValueError when that is no time or no number.
@@ -303,7 +310,7 @@ class History:
     def _marks(self, from_ns: int, to_ns: int) -> Iterator[Mark]:
         found = [
             mark
-            for marks in (self._infos, self._warned, self._steps)
+            for marks in (self._infos, self._warned, self._steps, self._references)
             for mark in marks
             if mark.time_ns < to_ns and (mark.time_ns if mark.level != "step" else mark.end_ns or to_ns) >= from_ns
         ]

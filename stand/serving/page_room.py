@@ -51,8 +51,9 @@ Camera = Annotated[str, Query(max_length=100)]
 
 class Curves(BaseModel):
     """Column n is width_ns wide and begins at from_ns + n * width_ns. low, high: smallest and largest value in it by
-    channel, null without one; a channel that is not in `high` has one value a column. marks: events and steps (level
-    "step"; end_ns null while it is under way)."""
+    channel, null without one; a channel that is not in `high` has one value a column. marks: events, steps (level
+    "step"; end_ns null while it is under way) and, of level "reference", from when on the drift of the camera `kind`
+    counts from another frame: a curve is not to be drawn over that instant."""
 
     from_ns: int
     width_ns: int

@@ -16,10 +16,12 @@ class StepFault(BaseModel):
 
 class PlanCheck(BaseModel):
     """faults: what is wrong, none when the steps would be taken; duration_s: how long they take then, else None.
-    texts: each of them in words, "" of one that is no step."""
+    texts: each of them in words, "" of one that is no step. set_points_degC: of the chamber at each of them, None while
+    it is stopped."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
     faults: tuple[StepFault, ...] = ()
     duration_s: float | None = None
     texts: tuple[str, ...] = ()
+    set_points_degC: tuple[float | None, ...] = ()

@@ -62,6 +62,7 @@ class Viewing:
         self._has_to_recall = False  # what drift counts from is in the session of the run, and not known here
         self._session: Callable[[], str] = str
         self._roles_seen: dict[str, str] = {}  # of the frame before, by camera
+        self._counted_from_ns: dict[str, int | None] = {}  # the frame that drift was last counted from, by camera
         hub.subscribe(self._follow)
 
     def _follow(self, item: Item) -> None:
@@ -169,6 +170,9 @@ class Viewing:
             self._warn(f"drift is measured against the first frame from now on, the run's own is not found: {error}")
 
     def _plot(self, camera: str, preview: Preview) -> None:
+        if preview.reference_ns != self._counted_from_ns.setdefault(camera, preview.reference_ns):
+            self._counted_from_ns[camera] = preview.reference_ns
+            self.history.reference(camera, preview.time_ns)
         if preview.mean_px is not None and preview.worst_px is not None:
             self.history.add(f"{camera}.drift_mean", preview.time_ns, preview.mean_px, "px")
             self.history.add(f"{camera}.drift_worst", preview.time_ns, preview.worst_px, "px")

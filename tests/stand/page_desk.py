@@ -19,6 +19,7 @@ from foundation.clock import NS_PER_S, WallClock
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading, bad_reading
 from stand.config.stand_config import load_config, packaged
+from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR
 from stand.running.memory.entries import Step as StepMarked
 from stand.running.memory.fold import fold
@@ -36,6 +37,7 @@ from stand.serving.desk import (
     RunStatus,
     StandState,
     StepStanding,
+    When,
     Who,
     WrittenStep,
 )
@@ -64,6 +66,7 @@ class NightDesk(ADesk):
         self.fault: FaultState | None = None
         self.prompt: PromptState | None = None
         self.is_idle = False
+        self.pausing = False
         self.is_heat_permitted = True
         self.lost = ""  # a device that does not answer
         self.stops = 0
@@ -119,6 +122,7 @@ class NightDesk(ADesk):
                 "output_percent": values.get("regulator.mv_heat"),
                 "heater_permitted": self.is_heat_permitted and not self.fault,
                 "compressor_on": bool(values.get("relays.compressor")),
+                "pausing": self.pausing,
                 "camera_on": True,
                 "flap": "closed",
                 "axes": {"linear": 135.0, "rotary": -15.0},
@@ -195,8 +199,12 @@ class NightDesk(ADesk):
             DeviceState(name="camera", kind="camera", verbs=(DeviceVerb(verb="frame", text="Take one frame"),)),
         )
 
+    def pause(self, who: Who, when: When = "now") -> Done:
+        self.pausing = when == "step"
+        return self._done(who, "pause", {"when": when}) if self.pausing else super().pause(who, when)
+
     def continue_(self, who: Who) -> Done:
-        self.prompt = None
+        self.prompt, self.pausing = None, False
         return super().continue_(who)
 
     def clear(self, who: Who) -> Done:
@@ -218,7 +226,7 @@ class NightDesk(ADesk):
         """The air is too warm."""
         self.gate.hold(INTERLOCK)
         text = "thermometers.air is at 71.2 degC, above 70 degC"
-        data = {"channel": "thermometers.air", "value": 71.2, "limit": 70.0}
+        data = {"channel": "thermometers.air", "value": 71.2, "limit": 70.0, **Fault("air_too_warm", text).data}
         self.fault = FaultState(rule="air_too_warm", text=text, since_ns=self.clock.now_ns(), data=data)
         self.hub.publish(Event(self.clock.now_ns(), "error", "tripped", text, data))
 

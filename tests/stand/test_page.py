@@ -1,13 +1,15 @@
 """What the page shows, in a real browser. The stand behind it is a desk that a test sets."""
 
 import asyncio
+import re
+from itertools import combinations
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from axe_playwright_python.base import AXE_SCRIPT
 
 from foundation.clock import NS_PER_S
-from foundation.items import Batch
+from foundation.items import Batch, StepMark, StepState
 from foundation.readings import Reading
 from stand.gate import CAMERA_LOST
 from stand.serving.desk import HeatByHand
@@ -24,6 +26,21 @@ const points = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
 return points.filter((value, n) => n % 4 === 3 && value).length }"""
 WHOLE_HEADER = """() => [...document.querySelectorAll("header .who, header .doing, header .eta")].every(
     (part) => part.scrollWidth <= part.clientWidth && part.scrollHeight <= part.clientHeight + 1)"""
+
+
+# Values of five columns, of which the fourth has none; drift counts anew in the second.
+BY_REFERENCE = """async () => { const { table } = await import("/static/curves.js");
+const marks = [{ level: "reference", kind: "camera", time_ns: 1.5e9 },
+  { level: "reference", kind: "other", time_ns: 0 }];
+const low = { "camera.drift_mean": [1, 2, 3, null, 5] };
+const drawn = table({ from_ns: 0, width_ns: 1e9, points: 5, low, high: {}, marks }, ["camera.drift_mean"], 0)[1];
+return drawn.map((value) => (value === undefined ? "undefined" : value)) }"""
+
+
+async def until_looked_at(night, role):
+    async with asyncio.timeout(60):
+        while night.viewing.previews.get("camera") is None or night.viewing.previews["camera"].role != role:
+            await asyncio.sleep(0.05)
 
 
 async def ink(page):
@@ -48,6 +65,11 @@ async def test_the_page_shows_the_stand_and_its_curves_move(night):
             before = await picture(page)
             while await picture(page) == before:
                 await asyncio.sleep(0.2)
+        trend = row.locator("td").last
+        await trend.get_by_text(re.compile(r"K|steady")).wait_for()
+        night.lost = "thermometers"
+        await row.locator(".value", has_text="no reading").wait_for()
+        assert not await trend.inner_text()  # of what is not read nobody knows where it goes
 
 
 async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_answer(night):
@@ -98,6 +120,25 @@ async def test_what_is_not_confirmed_safe_is_seen_until_it_is(night):
         await fault.get_by_text("The stand is made safe.").wait_for()
 
 
+@pytest.mark.usefixtures("compiled_fit")
+async def test_the_drift_of_two_references_is_no_one_line(night):
+    """Two series of reference frames, as of two runs: the page breaks its line where drift begins to count anew."""
+    history = night.viewing.history
+    async with a_page(night.chromium, night.port) as page:
+        for moved_px in (0.0, 0.3):
+            night.hub.publish(StepMark(0, "r", 0, "Capture", StepState.STARTED, {"role": "reference"}))
+            night.hub.publish(frame_of(target_image(moved_px, 0), night.clock.now_ns(), "r"))
+            night.hub.publish(StepMark(0, "f", 0, "Capture", StepState.STARTED, {"role": "fit"}))
+            await until_looked_at(night, "reference")
+            night.hub.publish(frame_of(target_image(moved_px + 0.5, 0), night.clock.now_ns(), "f"))
+            await until_looked_at(night, "fit")
+        now_ns = night.clock.now_ns()
+        (mark,) = [each for each in history.columns(now_ns - NS_PER_S * 60, now_ns).marks if each.level == "reference"]
+        assert mark.kind == "camera"
+        broken = await page.evaluate(BY_REFERENCE)
+        assert broken == [1, None, 3, "undefined", 5]
+
+
 async def test_event_marks_and_the_night_are_there_after_a_reload(night):
     async with a_page(night.chromium, night.port) as page:
         await page.get_by_role("button", name="12 h").click()
@@ -145,6 +186,14 @@ async def test_markers_and_drift_of_the_last_frame_are_shown(night):
         assert "54 markers found; mean drift" in label
 
 
+def overlap_px(one, other):
+    """By how much two boxes lie over each other, in the direction in which that is less; negative when apart."""
+    return min(
+        min(one[at] + one[size], other[at] + other[size]) - max(one[at], other[at])
+        for at, size in (("x", "width"), ("y", "height"))
+    )
+
+
 async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
     for name, warm_degC in (("monday", 24.0), ("tuesday", 30.0)):
 
@@ -165,6 +214,11 @@ async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
             await page.get_by_text(text).wait_for()
         await page.get_by_role("button", name="Close").click()
         await curves.wait_for(state="detached")
+    async with a_page(night.chromium, night.port, "sessions", PHONE) as page:
+        row = page.locator(".sessions tr", has_text="monday")
+        await row.get_by_text("2026", exact=False).wait_for()  # of which year, also in that year
+        boxes = [box for cell in await row.locator("td").all() if (box := await cell.bounding_box())]
+        assert not [(a, b) for a, b in combinations(boxes, 2) if overlap_px(a, b) > 1]
 
 
 async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path, chromium):

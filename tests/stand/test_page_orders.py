@@ -3,6 +3,7 @@ test sets."""
 
 import asyncio
 import json
+import re
 
 import pytest
 
@@ -10,6 +11,8 @@ from foundation.documents import parse_document
 from stand.config.recipe import Recipe
 from stand.config.stand_config import packaged
 from stand.gate import NOT_RECORDED, OPERATOR
+from stand.serving.desk import QueuedRun
+from stand.serving.not_confirmed import NotConfirmed
 from tests.stand.browser import DESKTOP, PHONE, VIEWS, a_page, needs_chromium
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
@@ -19,6 +22,10 @@ const [w, h] = [b.width, b.height];
 const inside = b.top >= 0 && b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight;
 const points = [[8, 8], [w - 8, 8], [8, h - 8], [w - 8, h - 8], [w / 2, h / 2]];
 return inside && points.every(([x, y]) => document.elementFromPoint(b.left + x, b.top + y)?.id === "stop") }"""
+
+
+BELOW_HEADER = """() => document.activeElement.matches("input:invalid") &&
+document.activeElement.getBoundingClientRect().top >= document.querySelector("header").getBoundingClientRect().bottom"""
 
 
 async def until(check, timeout_s=30.0):
@@ -37,6 +44,10 @@ async def test_pause_and_continue_make_the_round(night):
         await page.locator("main").get_by_role("button", name="Continue").click()
         await page.locator("#phase", has_text="Running").wait_for()
         assert [verb for _, verb, _ in night.orders] == ["pause", "continue"]
+        await page.get_by_role("button", name="Pause after this step").click()
+        await page.get_by_role("button", name="Do not pause after this step").click()
+        await page.get_by_role("button", name="Pause after this step", exact=True).wait_for()
+        assert [verb for _, verb, _ in night.orders[2:]] == ["pause", "continue"]
         night.gate.hold(NOT_RECORDED)
         await page.get_by_text("The run is held: the disk takes no telemetry").wait_for()
         await page.get_by_text("It goes on when the disk takes what waits").wait_for()
@@ -47,10 +58,16 @@ async def test_stop_is_immediate_and_asks_nothing(night):
         await page.get_by_text("Running", exact=True).wait_for()
         box = await page.locator("#stop").bounding_box()
         await page.mouse.move(box["x"] + 20, box["y"] + 20)
+        night.not_confirmed = (NotConfirmed(name="flap", since_ns=night.clock.now_ns()),)
         await page.mouse.down()  # not even the release is waited for
         await until(lambda: night.stops)
+        notice = page.get_by_role("alert").filter(has_text="STOP, pressed at")
+        assert re.search(r"pressed at \d\d:\d\d:\d\d", await notice.inner_text())
         await page.get_by_text("the stand is made safe").first.wait_for()
         await page.locator("#phase", has_text="Stopping").wait_for()
+        await notice.get_by_text("Not yet confirmed safe: flap").wait_for()
+        night.not_confirmed = ()
+        await notice.get_by_text(re.compile(r"Confirmed at \d\d:\d\d:\d\d: .*the flap is closed")).wait_for()
 
 
 async def test_escape_twice_stops_and_once_does_not(night):
@@ -106,7 +123,10 @@ async def test_a_fault_appears_and_is_cleared_only_after_it_was_shown(night):
         assert not await page.get_by_role("button", name="The cause is removed").is_visible()
         await page.get_by_role("button", name="Look at it and clear").click()
         await page.get_by_text("Readings now").wait_for()
-        assert "°C" in await alert.inner_text()
+        said = await alert.inner_text()
+        assert "°C" in said
+        assert "It ends a run, which can be resumed once this is cleared." in said
+        assert not [word for word in ("abort", "false", "true", "ends itself") if word in said]
         await page.get_by_role("button", name="The cause is removed").click()
         await page.locator("#phase", has_text="Running").wait_for()
         await alert.wait_for(state="detached")
@@ -155,7 +175,9 @@ async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night
         assert not night.edited
         assert await rows.nth(2).locator(".error").is_hidden()
         await rows.nth(0).get_by_label("chamber °C").fill("30")
-        assert await rows.nth(3).get_by_label("chamber °C").input_value() == "30"  # the label of the frames there
+        await rows.nth(3).get_by_text("5 frames at 30 °C").wait_for()
+        label = rows.nth(3).get_by_label("chamber °C")  # follows from the steps before, and nobody types it
+        assert (await label.input_value(), await label.is_editable()) == ("30", False)
         await rows.nth(1).get_by_label("duration, s").fill("600")
         await rows.nth(1).get_by_text("soak for 10 min").wait_for()
         await editor.get_by_role("button", name="Later: step 34").click()
@@ -168,7 +190,7 @@ async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night
         await until(lambda: night.edited)
         await editor.wait_for(state="detached")
         assert night.orders[-1][2] == {"from_index": 32, "steps": 5}
-        assert night.edited[3].parameters["chamber_degC"] == 30
+        assert "chamber_degC" not in night.edited[3].parameters
         assert [step.kind for step in night.edited] == ["StartChamber", "Soak", "Soak", "Capture", "Prompt"]
 
 
@@ -199,6 +221,7 @@ async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):
         await page.get_by_label("frames", exact=True).first.fill("-5")
         await page.get_by_role("button", name="Add to the queue").click()
         assert len(night.queue) == 3  # the browser says what is wrong with the field
+        assert await page.evaluate(BELOW_HEADER)
 
 
 async def test_steps_and_parts_within_parts_have_fields_of_their_own(night):
@@ -231,6 +254,22 @@ async def test_runs_are_moved_by_buttons_and_by_dragging_and_removed_after_a_que
         await page.get_by_role("button", name="Remove: run 4").click()
         await page.get_by_role("button", name="Remove it").click()
         await until(lambda: len(night.queue) == 1)
+
+
+async def test_a_run_that_has_tripped_is_resumed_once_that_is_cleared(night):
+    began_ns = night.clock.now_ns()
+    night.queue = [
+        QueuedRun(id=5, recipe="overnight", state="failed", added_ns=began_ns, session="20261122T180000Z-overnight")
+    ]
+    night.trip()
+    async with a_page(night.chromium, night.port, "queue") as page:
+        await page.get_by_text("clear it, above; then a run can be resumed").wait_for()
+        resume = page.get_by_role("button", name="Resume: run 5")
+        assert await resume.is_disabled()
+        await page.get_by_role("button", name="Look at it and clear").click()
+        await page.get_by_role("button", name="The cause is removed").click()
+        await resume.click()  # waits until it may
+        await page.get_by_text("a run has the stand").wait_for()  # what this desk answers
 
 
 async def test_devices_take_orders_only_between_runs(night):

@@ -7,11 +7,11 @@ from typing import Any, cast
 import pytest
 from pydantic import JsonValue
 
-from experiments.steps import OpenFlap, Soak, StartChamber, StopChamber, number_steps
+from experiments.steps import Capture, OpenFlap, Soak, StartChamber, StopChamber, number_steps
 from stand.config.stand_config import load_config, packaged
 from stand.running.memory.entries import Step
 from stand.running.memory.fold import fold
-from stand.running.plan_check import check_edit
+from stand.running.plan_check import check_edit, steps_of
 from stand.serving.client import server_of
 from stand.serving.desk import WrittenStep
 from tests.stand.a_desk import ADesk, served
@@ -27,17 +27,32 @@ def written(kind: str, **parameters: JsonValue) -> WrittenStep:
 
 SOAK = written("Soak", duration_s=600.0)
 FIT = written("Capture", frames=2, interval_s=60.0, exposure_s=0.1, role="fit", chamber_degC=24.0)
+UNLABELLED = WrittenStep(kind="Capture", parameters={k: v for k, v in FIT.parameters.items() if k != "chamber_degC"})
+COLDER, OPEN = written("SetTemperature", chamber_degC=18.0), written("OpenFlap")
+UNTIL: dict[str, JsonValue] = {"max_s": 900.0, "min_s": 60.0, "window_s": 240.0, "look_every_s": 60.0}
+UNTIL |= {"camera_K_per_min": 0.2, "drift_px_per_min": 0.003, "exposure_s": 0.1}
+
+
+def labelled(step: WrittenStep, **parameters: JsonValue) -> WrittenStep:
+    return WrittenStep(kind=step.kind, parameters={**step.parameters, **parameters})
 
 
 @pytest.mark.parametrize(
     ("from_index", "steps", "faults"),
     [
         (1, [SOAK, written("Soak", duration_s=-1), SOAK, written("Teleport")], {2: "is -1", 4: "no step is called"}),
-        (1, [written("SetTemperature", chamber_degC=71), SOAK, FIT], {1: "give -10 to 70", 3: "give open_flap"}),
+        (1, [written("SetTemperature", chamber_degC=71), SOAK, UNLABELLED], {1: "give -10 to 70", 3: "give open_flap"}),
         (1, [SOAK, written("MoveTo", axis="linear", position=9e9)], {2: "outside the limits"}),
         (1, [written("MoveTo", axis="up", position=1), SOAK], {1: "up"}),
         (0, [SOAK], {None: "the steps from number 2 on can be replaced, not those from number 1 on"}),
         (1, [written("Soak", duration_s=4e7)], {None: "more than a year is refused"}),
+        (1, [OPEN, labelled(FIT, chamber_degC=95)], {2: "95"}),
+        (1, [COLDER, OPEN, FIT], {3: "18"}),
+        (1, [written("SoakUntilSettled", **UNTIL, chamber_degC=25)], {1: "25"}),
+        (1, [written("SoakUntilSettled", **UNTIL, role="fit")], {1: "settling"}),
+        (1, [OPEN, labelled(FIT, role="settling")], {2: "settling"}),
+        (1, [written("StopChamber"), OPEN, UNLABELLED], {3: "chamber_degC"}),
+        (1, [written("StopChamber"), written("SoakUntilSettled", **UNTIL, chamber_degC=24)], {2: "start_chamber"}),
     ],
 )
 def test_what_is_wrong_is_said_of_each_step(from_index, steps, faults):
@@ -54,6 +69,14 @@ def test_steps_with_which_nothing_is_wrong_have_a_duration_and_their_words():
     assert found.duration_s == pytest.approx(663.1)
 
 
+def test_frames_are_at_the_set_point_of_the_steps_before():
+    steps = [OPEN, UNLABELLED, COLDER, labelled(FIT, chamber_degC=None), written("StopChamber"), FIT]
+    found = check_edit(BEGUN, 1, steps, CONFIG)
+    assert (found.faults, found.set_points_degC) == ((), (24.0, 24.0, 24.0, 18.0, 18.0, None))
+    made = [step for step, _ in steps_of(PLAN, 1, steps)]
+    assert [step.chamber_degC for step in made if isinstance(step, Capture)] == [24.0, 18.0, 24.0]
+
+
 async def test_the_interface_checks_an_edit_and_gives_the_form_of_each_step(tmp_path: Path):
     async with served(ADesk(), tmp_path) as desk:
         server = server_of(tmp_path)
@@ -62,4 +85,7 @@ async def test_the_interface_checks_an_edit_and_gives_the_form_of_each_step(tmp_
         assert found["faults"][0]["index"] == 1
         schema = cast("Any", await asyncio.to_thread(server.request, "GET", "/api/v1/plan/schema", None))
         assert schema["$defs"]["Soak"]["properties"].keys() == {"duration_s"}
+        for kind in ("Capture", "SoakUntilSettled"):
+            assert schema["$defs"][kind]["properties"]["chamber_degC"]["readOnly"]
+            assert "chamber_degC" not in schema["$defs"][kind]["required"]
         assert (desk.orders, desk.edited) == ([], ())

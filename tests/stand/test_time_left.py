@@ -118,6 +118,9 @@ def test_what_an_operator_changes_of_the_plan_changes_the_time_left(config: Stan
     eta.event(changed(Extended(0, plan[0].step_id, 50.0)))
     eta.event(changed(Extended(0, plan[1].step_id, 7.0)))
     assert eta.left_s(now_ns) == 917.0
+    first, second, third = (each.step_id for each in plan)
+    assert [eta.expected_s(each.step_id) for each in plan] == [650.0, 307.0, 60.0]
+    assert eta.ends_s(now_ns) == {first: 550.0, second: 857.0, third: 917.0}
     eta.event(changed(Skipped(0, plan[2].step_id)))
     eta.mark(StepMark(now_ns, plan[2].step_id, 2, "Soak", StepState.SKIPPED))
     assert eta.left_s(now_ns) == 857.0
@@ -126,6 +129,7 @@ def test_what_an_operator_changes_of_the_plan_changes_the_time_left(config: Stan
     ]
     eta.event(changed(Edited(0, 1, by)))
     assert (eta.left_s(now_ns), eta.count) == (640.0, 4)
+    assert list(eta.ends_s(now_ns).values()) == [550.0, 570.0, 600.0, 640.0]
     eta.mark(StepMark(now_ns, plan[0].step_id, 0, "Soak", StepState.SKIPPED))
     eta.event(changed(Skipped(0, plan[0].step_id)))
     assert eta.left_s(now_ns) == 90.0

@@ -73,6 +73,12 @@ async def test_a_night_is_begun_watched_paused_and_stopped_in_a_browser(served_p
         await page.get_by_text(", reference").wait_for()
         await page.goto(f"http://127.0.0.1:{port}/#plan")
         await page.locator(".steps li[data-standing='under_way']", has_text="soak").wait_for()
+        await page.get_by_role("button", name="+15 min").click()
+        await page.locator(".steps li[data-standing='under_way']", has_text="1 h 15 min").wait_for()
+        plan = await asyncio.to_thread(served.server.request, "GET", "/api/v1/plan", None)
+        state = await asyncio.to_thread(served.state)
+        assert plan[-1]["duration_s"] == 4500.0
+        assert abs(plan[-1]["expected_ns"] - state.run.end_ns) < 5e9  # the row and the header
         await page.get_by_role("button", name="Pause now").click()
         await page.locator("#phase", has_text="Held").wait_for()
         await until(served, lambda state: state.reasons == ("operator",))

@@ -7,14 +7,26 @@ const MARK = { error: ["--bad", "▲"], warning: ["--warn", "◆"] };
 const LABELS_px = 104; // to the right of the curves
 const font = "12px system-ui, sans-serif";
 
+const is_drift = (channel) => channel.includes(".drift_");
+
+// A line goes on over the times without frames (undefined), and ends where drift begins to count from another frame (null).
+function by_reference(history, channel, values) {
+  const camera = channel.split(".")[0], line = values.map((value) => value ?? undefined);
+  for (const { level, kind, time_ns } of history.marks) {
+    const at = Math.floor((time_ns - history.from_ns) / history.width_ns);
+    if (level === "reference" && kind === camera && at >= 0 && at < line.length) line[at] = null;
+  }
+  return line;
+}
+
 // history -> uPlot's columns: x in s, then low and high of each channel.
 export function table(history, channels, offset_s) {
   const middle = history.width_ns / 2e9;
   const x = Array.from({ length: history.points }, (_, n) => (history.from_ns + n * history.width_ns) / 1e9 + middle + offset_s);
   const none = Array(history.points).fill(null);
   return [x, ...channels.flatMap((channel) => {
-    const low = history.low[channel] ?? none;
-    return [low, history.high[channel] ?? low];
+    const low = history.low[channel] ?? none, both = [low, history.high[channel] ?? low];
+    return is_drift(channel) ? both.map((values) => by_reference(history, channel, values)) : both;
   })];
 }
 
@@ -69,7 +81,7 @@ export class Curves {
     const axis = { stroke: css("--quiet"), font, grid: { stroke: css("--faint"), width: 1 }, ticks: { stroke: css("--line"), width: 1, size: 4 } };
     const series = channels.flatMap((channel) => {
       const look = look_of(channel);
-      const line = { stroke: css(look.colour), width: look.width, dash: look.dash, points: { show: false }, spanGaps: channel.includes(".drift_") };
+      const line = { stroke: css(look.colour), width: look.width, dash: look.dash, points: { show: false } };
       return [{ ...line, label: look.name }, { ...line, label: `${look.name}, highest`, width: look.width * 0.6 }];
     });
     const bands = channels.map((channel, index) => ({ series: [2 * index + 2, 2 * index + 1], fill: `${css(look_of(channel).colour)}44` }));

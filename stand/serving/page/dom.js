@@ -39,6 +39,12 @@ export function day_clock(utc_s) {
   return is_today ? clock(utc_s) : `${day} ${clock(utc_s)}`;
 }
 
+// Of what may be years ago.
+export function dated_clock(utc_s) {
+  const day = new Date(utc_s * 1000).toLocaleDateString([], { day: "numeric", month: "short", year: "numeric" });
+  return `${day}, ${clock(utc_s)}`;
+}
+
 export function duration(s) {
   const total = Math.max(0, Math.round(s));
   const hours = Math.floor(total / 3600), minutes = Math.floor((total % 3600) / 60);
@@ -69,6 +75,12 @@ export function bytes(count) {
 }
 
 export const words = (name) => name.replace("setpoint", "set-point").replace(/_degC$/, " °C").replace(/_deg$/, ", °").replace(/_(mm|s|K|px|Wh)$/, ", $1").replaceAll("_", " ");
+
+// Resume, while a trip is not cleared: why not, beside the button.
+export function hold_resumes(place, note, { fault }) {
+  for (const button of place.querySelectorAll("button[data-resume]")) button.disabled = Boolean(fault);
+  say(note, fault && place.querySelector("button[data-resume]") ? "The stand has tripped: look at it and clear it, above; then a run can be resumed." : "");
+}
 
 export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 

@@ -70,7 +70,7 @@ function lost() {
   notices.lost(`${since}Trying again. The stand guards itself; to stop it now, press STOP or its emergency stop.`);
 }
 
-arm(at("stop"), notices);
+arm(at("stop"), notices, app);
 addEventListener("hashchange", open);
 document.addEventListener("visibilitychange", () => { if (!document.hidden) app.view?.soon?.(); });
 open();

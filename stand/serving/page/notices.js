@@ -13,6 +13,12 @@ const ENDS = {
   disk_low: "It goes on when there is room: stand session archive copies what is finished elsewhere.",
   not_recorded: "It goes on when the disk takes what waits: see that it is there, has room and answers.",
 };
+// What the guard does about a fault: FaultState.data of a rule of the stand.
+const DOES = {
+  abort: () => "It ends a run, which can be resumed once this is cleared.",
+  hold: ({ ends_itself }) => (ends_itself ? "It holds a run, which goes on by itself when this is over." : "It holds a run until somebody clears this."),
+  warn: () => "It says so, and stops nothing.",
+};
 const FIRST = ["unsafe", "lost"]; // all else is of before while the connection is lost
 export const reason = (name) => REASON[name] ?? words(name);
 
@@ -45,6 +51,7 @@ export class Notices {
     this.set("prompt", prompt && `${prompt.step_id} ${prompt.text}`, () => this.prompt(prompt));
     const held = state.run && !fault && !prompt && state.reasons.length ? state.reasons.join() : "";
     this.set("held", held, () => this.held(state))?.refresh(state);
+    this.stopped(state);
     this.set("queue", !state.run && state.queue_halted, () => this.halted(state));
   }
 
@@ -71,9 +78,10 @@ export class Notices {
       review.hidden = !review.hidden;
       open.setAttribute("aria-expanded", String(!review.hidden));
     } }, "Look at it and clear …");
-    const data = Object.entries(fault.data ?? {}).filter(([, value]) => typeof value !== "object");
+    const { action, ends_itself, ...measured } = fault.data ?? {};
+    const does = DOES[action]?.({ ends_itself }), data = Object.entries(measured).filter(([, value]) => typeof value !== "object");
     fill(review, h("div", { class: "row" }, h("div", { class: "grow" }, h("h3", {}, "What tripped"),
-      h("dl", { class: "facts" }, [["rule", words(fault.rule)], ["found", fault.text], ["at", clock(seconds(fault.since_ns, state.utc_offset_ns), true)], ...data.map(([name, value]) => [words(name), String(value)])].map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]))),
+      h("dl", { class: "facts" }, [["rule", words(fault.rule)], ["found", fault.text], ["at", clock(seconds(fault.since_ns, state.utc_offset_ns), true)], ...(does ? [["the guard", does]] : []), ...data.map(([name, value]) => [words(name), String(value)])].map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]))),
       h("div", { class: "grow" }, h("h3", {}, "Readings now"), readings)), h("div", { class: "row" }, clear));
     const since = h("p", {});
     const element = h("section", { class: "notice error", role: "alert" }, h("h2", {}, `Tripped: ${words(fault.rule)}`), h("p", {}, fault.text),
@@ -100,6 +108,27 @@ export class Notices {
     return { element };
   }
 
+  // STOP was pressed: when, and below it what the stand answers and what it has confirmed. It stays until a run begins.
+  pressed() {
+    const at_s = this.app.state ? this.app.now_s() : Date.now() / 1000;
+    const answer = h("p", {}, "stopping …"), outcome = h("p", {});
+    return this.set("stop", `stop ${Date.now()}`, () => ({ answer, outcome, seq: Infinity, element: h("section", { class: "notice error", role: "alert" },
+      h("h2", {}, `STOP, pressed at ${clock(at_s, true)}`), answer, outcome,
+      h("div", { class: "row" }, h("button", { type: "button", class: "small", onclick: () => this.set("stop", "", null) }, "Put this away"))) }));
+  }
+
+  // seq: of the command that stopped; what the stand says of before it confirms nothing.
+  stopped(state) {
+    const made = this.parts.stop;
+    if (!made || state.seq < made.seq) return;
+    if (made.is_confirmed) { if (state.phase === "running") this.set("stop", "", null); return; }
+    const names = state.not_confirmed.map(({ name }) => words(name)).join(", ");
+    if (names) return say(made.outcome, `Not yet confirmed safe: ${names}.`);
+    made.is_confirmed = true;
+    made.element.classList.replace("error", "warning");
+    say(made.outcome, `Confirmed at ${clock(this.app.now_s(), true)}: ${confirmed(state)}.`);
+  }
+
   halted(state) {
     const answer = h("p", { class: "answer", role: "status" });
     const button = h("button", { type: "button", onclick: () => command(answer, "go on", "POST", "/run/clear") }, "Go on with the queue");
@@ -123,6 +152,13 @@ function chamber_of({ heater_permitted, setpoint_degC, readings }) {
   if (setpoint_degC !== null) return "The chamber keeps its set-point.";
   if (readings["regulator.running"]?.value === 0) return "The regulator is stopped.";
   return "Heat and cold are permitted; the regulator's set-point is not known now.";
+}
+
+// The safe state of each part that there is (stand/safety.py): each has confirmed it.
+function confirmed({ flap, axes }) {
+  const stages = Object.keys(axes).map(words);
+  const parts = ["heat and cold are off", flap === "none" ? "" : "the flap is closed", stages.length ? `the stages (${stages.join(", ")}) stand still` : ""];
+  return parts.filter(Boolean).join(", ");
 }
 
 function not_yet({ name, since_ns, reason, timer_s }, { utc_offset_ns }) {

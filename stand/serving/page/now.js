@@ -172,7 +172,7 @@ export class Now {
       : reading.value === null && !state.camera_on && this.app.cameras().includes(channel.split(".")[0]) ? "off" : "";
     if (unasked) row.dataset.quality = "good"; // nobody expects one now
     say(value, unasked || (reading.value === null ? bad ?? "–" : `${number(reading.value, 2)} °C${bad ? ` (${bad})` : ""}`));
-    say(trend, channel === "regulator.sp" ? "" : arrow(this.trends[channel]));
+    say(trend, channel === "regulator.sp" || unasked || reading.quality !== "good" ? "" : arrow(this.trends[channel]));
   }
 
   update_flags(state) {
@@ -200,7 +200,7 @@ export class Now {
   }
 
   show_events(marks) {
-    const listed = marks.filter((mark) => mark.level !== "step").slice(-100).reverse();
+    const listed = marks.filter((mark) => !["step", "reference"].includes(mark.level)).slice(-100).reverse();
     const key = listed.map((mark) => mark.time_ns).join();
     if (key === this.listed) return;
     this.listed = key;

@@ -16,7 +16,7 @@ export class Plan {
     this.answer = h("p", { class: "answer", role: "status" });
     this.buttons = h("div", { class: "row" },
       this.pause = h("button", { type: "button", onclick: () => this.order("pause", { when: "now" }, "pause") }, "Pause now"),
-      this.pause_step = h("button", { type: "button", onclick: () => this.order("pause", { when: "step" }, "pause when this step is done") }, "Pause after this step"),
+      this.pause_step = h("button", { type: "button", onclick: () => this.pause_after() }, "Pause after this step"),
       this.go = h("button", { type: "button", class: "main", onclick: () => this.order("continue", undefined, "continue") }, "Continue"),
       this.edit_button = h("button", { type: "button", onclick: () => this.edit() }, "Edit the steps to come …"),
       this.abort = h("button", { type: "button", class: "danger", onclick: () => this.end() }, "End the run …"));
@@ -38,6 +38,11 @@ export class Plan {
   async order(verb, body, text) {
     await command(this.answer, text, "POST", `/run/${verb}`, body);
     this.refresh();
+  }
+
+  pause_after() {
+    if (this.app.state?.pausing) return this.order("continue", undefined, "take the pause back");
+    return this.order("pause", { when: "step" }, "pause when this step is done");
   }
 
   end() {
@@ -109,13 +114,14 @@ export class Plan {
     if (!state) return;
     const is_run = state.run !== null, is_held = state.reasons.length > 0;
     this.pause.disabled = this.pause_step.disabled = !is_run || state.reasons.includes("operator");
+    say(this.pause_step, is_run && state.pausing ? "Do not pause after this step" : "Pause after this step");
     this.go.disabled = !is_run || !state.reasons.includes("operator");
     this.abort.disabled = !is_run;
     this.edit_button.disabled = !is_run || !this.steps.length;
     if (!is_run) return say(this.summary, "No run is under way.");
     const run = state.run;
     const end = run.end_ns === null ? "" : `; ends ${day_clock(seconds(run.end_ns, run.utc_offset_ns))}${uncertainty(run)}`;
-    say(this.summary, `${run.recipe}, session ${run.run_id || "–"}: step ${run.step} of ${run.steps}${is_held ? `, held: ${state.prompt ? "it waits for you" : state.reasons.map(this.app.reason).join(", ")}` : ""}${end}`);
+    say(this.summary, `${run.recipe}, session ${run.run_id || "–"}: step ${run.step} of ${run.steps}${is_held ? `, held: ${state.prompt ? "it waits for you" : state.reasons.map(this.app.reason).join(", ")}` : state.pausing ? ", pauses when it is done" : ""}${end}`);
   }
 
   draw() {

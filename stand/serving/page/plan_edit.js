@@ -2,13 +2,13 @@
 // change, and what is wrong stands in the row that it is about; nothing is replaced before nothing is wrong.
 import { command, get, send, tell } from "./api.js";
 import { duration, fill, h, words } from "./dom.js";
-import { RecipeForm, collect } from "./recipe_form.js";
+import { RecipeForm, collect, set_fixed } from "./recipe_form.js";
 
 const CHECK_MS = 400;
 const MOST_ROWS = 200; // with fields; of a longer plan the steps behind stay as they are
 
-const SETS = ["StartChamber", "SetTemperature"]; // the chamber's set-point; other steps are labelled with it
-
+// What only a plan can give cannot be added by hand.
+const is_addable = ({ properties, required }) => properties && !required?.some((name) => properties[name].readOnly);
 const kind_words = (kind) => kind.replace(/([a-z])([A-Z])/g, "$1 $2").toLowerCase();
 
 export class PlanEdit {
@@ -16,10 +16,10 @@ export class PlanEdit {
   constructor(place, schema, axes, from_index, steps, answer, over) {
     Object.assign(this, { place, schema, from_index, answer, over, form: new RecipeForm(schema, axes) });
     this.kept = steps.slice(MOST_ROWS).map(({ kind, parameters }) => ({ kind, parameters }));
-    this.list = h("ol", { class: "edited", oninput: (event) => this.typed(event.target) });
+    this.list = h("ol", { class: "edited", oninput: () => this.soon() });
     this.rows = steps.slice(0, MOST_ROWS).map((step) => this.row(step.kind, step.parameters, step.step_id, step.text));
     this.whole = h("p", { class: "answer", role: "status" });
-    this.kind = h("select", { "aria-label": "Kind of step to add" }, Object.keys(schema.$defs).filter((kind) => kind !== "Role").map((kind) => h("option", { value: kind }, kind_words(kind))));
+    this.kind = h("select", { "aria-label": "Kind of step to add" }, Object.keys(schema.$defs).filter((kind) => is_addable(schema.$defs[kind])).map((kind) => h("option", { value: kind }, kind_words(kind))));
     this.kind.value = "Soak";
     this.head = h("h3", { tabindex: "-1" });
     fill(place, h("div", { class: "ask", role: "group", "aria-label": "Steps to come" }, this.head, this.list,
@@ -37,12 +37,11 @@ export class PlanEdit {
     const button = (name, act) => h("button", { type: "button", class: "small", onclick: () => act(row) }, name);
     row.number = h("span", { class: "index number quiet" });
     row.words = h("b", {}, text || kind_words(kind));
-    row.degC = row.fields.find(({ name }) => name === "chamber_degC")?.row.querySelector("input");
-    row.was_degC = row.degC?.value;
+    // The set-point of frames is what the steps before make it: the stand says it, and a label is typed only where there is none.
+    row.degC = this.schema.$defs[kind].properties.chamber_degC?.readOnly ? row.fields.find(({ name }) => name === "chamber_degC").row.querySelector("input") : null;
     row.fault = h("p", { class: "answer error", hidden: true });
-    row.note = h("p", { class: "level-warning", hidden: true });
     row.acts = [button("▲", (each) => this.move(each, -1)), button("▼", (each) => this.move(each, 1)), button("Duplicate", (each) => this.duplicate(each)), button("Remove", (each) => this.remove(each))];
-    row.element = h("li", {}, row.number, h("div", { class: "what" }, row.words, h("div", { class: "values" }, row.fields.map((each) => each.row)), row.fault, row.note), h("span", { class: "acts" }, row.acts));
+    row.element = h("li", {}, row.number, h("div", { class: "what" }, row.words, h("div", { class: "values" }, row.fields.map((each) => each.row)), row.fault), h("span", { class: "acts" }, row.acts));
     return row;
   }
 
@@ -75,7 +74,7 @@ export class PlanEdit {
 
   duplicate(row) {
     let parameters;
-    try { parameters = collect(row.fields); } catch (error) { return this.fault(row, error.message); }
+    try { parameters = this.parameters(row); } catch (error) { return this.fault(row, error.message); }
     const twin = this.row(row.kind, parameters, "", row.words.textContent);
     this.rows.splice(this.rows.indexOf(row) + 1, 0, twin);
     this.changed(twin.acts[2]);
@@ -91,34 +90,33 @@ export class PlanEdit {
   add() {
     const like = this.rows.findLast((each) => each.kind === this.kind.value);
     let parameters = {};
-    try { parameters = like ? collect(like.fields) : {}; } catch { /* its row says so */ }
+    try { parameters = like ? this.parameters(like) : {}; } catch { /* its row says so */ }
     const row = this.row(this.kind.value, parameters);
     this.rows.push(row);
     this.changed();
     (row.element.querySelector("input, select, textarea") ?? row.acts[3]).focus();
   }
 
-  // A new set-point is the label of the steps at it, too, where it was before.
-  typed(input) {
-    const at = this.rows.findIndex((row) => row.degC === input);
-    if (at >= 0) {
-      const before = this.rows[at].was_degC;
-      const next = this.rows.findIndex((row, index) => index > at && (SETS.includes(row.kind) || row.kind === "StopChamber"));
-      const its = SETS.includes(this.rows[at].kind) ? this.rows.slice(at + 1, next < 0 ? undefined : next) : [];
-      for (const row of [this.rows[at], ...its.filter(({ degC }) => degC?.value === before)]) row.degC.value = row.was_degC = input.value;
-    }
-    this.soon();
+  label({ degC }, at_degC) {
+    if (!degC || at_degC === undefined) return;
+    const is_fixed = at_degC !== null;
+    if (is_fixed !== degC.readOnly) this.soon(); // it was sent without its label, or with it
+    set_fixed(degC, is_fixed);
+    if (is_fixed) degC.value = String(at_degC);
   }
 
-  // Labels that are not the set-point before them; the stand takes them, and a report would show them.
-  labels() {
-    let at = null;
-    for (const { kind, degC, note } of this.rows) {
-      if (SETS.includes(kind)) at = degC.value;
-      const is_other = at !== null && degC && !SETS.includes(kind) && Number(degC.value) !== Number(at);
-      note.hidden = !is_other;
-      note.textContent = is_other ? `labelled ${degC.value} °C, but the chamber is at ${at} °C here` : "";
-    }
+  // The steps without fields; frames are at whatever set-point the rows now give the chamber.
+  behind() {
+    return this.kept.map(({ kind, parameters }, index) => {
+      const { chamber_degC, ...others } = parameters;
+      const is_given = typeof this.kept_degC?.[index] === "number" && this.schema.$defs[kind].properties.chamber_degC?.readOnly;
+      return { kind, parameters: is_given ? others : parameters };
+    });
+  }
+
+  parameters({ degC, fields }) {
+    const { chamber_degC, ...others } = collect(fields);
+    return degC?.readOnly || chamber_degC === undefined ? others : { ...others, chamber_degC };
   }
 
   soon() {
@@ -138,26 +136,29 @@ export class PlanEdit {
     const steps = this.rows.map((row) => {
       try {
         this.fault(row, "");
-        return { kind: row.kind, parameters: collect(row.fields) };
+        return { kind: row.kind, parameters: this.parameters(row) };
       } catch (error) {
         is_whole = false;
         this.fault(row, error.message);
         return null;
       }
     });
-    return is_whole ? [...steps, ...this.kept] : null;
+    return is_whole ? [...steps, ...this.behind()] : null;
   }
 
   // Whether the stand would take the steps as they are now. Of answers that overtake each other the last one asked for counts.
   async check() {
     clearTimeout(this.later);
-    this.labels();
     const asked = (this.asked = (this.asked ?? 0) + 1), steps = this.steps(), from_index = this.from_index;
     if (!steps) return tell(this.whole, "not all steps can be checked", true) ?? false;
     let found;
     try { found = await send("POST", "/run/plan/check", { from_index, steps }); } catch (error) { return tell(this.whole, error.message, true) ?? false; }
     if (asked !== this.asked || from_index !== this.from_index) return false;
-    this.rows.forEach((row, index) => { row.words.textContent = found.texts[index] || kind_words(row.kind); });
+    this.rows.forEach((row, index) => {
+      row.words.textContent = found.texts[index] || kind_words(row.kind);
+      this.label(row, found.set_points_degC[index]);
+    });
+    this.kept_degC = found.set_points_degC.slice(this.rows.length);
     for (const { index, text } of found.faults) if (this.rows[index - from_index]) this.fault(this.rows[index - from_index], text);
     const whole = found.faults.find(({ index }) => index === null || !this.rows[index - from_index]);
     const wrong = found.faults.length;

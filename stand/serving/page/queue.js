@@ -1,14 +1,17 @@
 // The queue of runs, and the form that adds one.
 import { command, get, tell } from "./api.js";
-import { ask, axes_of, day_clock, duration, fill, h, seconds } from "./dom.js";
+import { ask, axes_of, day_clock, duration, fill, h, hold_resumes, seconds } from "./dom.js";
 import { RecipeForm } from "./recipe_form.js";
 
 const ENDED = ["done", "failed", "stopped"];
+const RESUMABLE = ["interrupted", "stopped", "failed"]; // a run that has tripped has failed here
 const MOST_ENDED = 10;
 
 export class Queue {
   constructor(place, app) {
     this.app = app;
+    this.place = place;
+    this.resumes = h("p", { class: "level-warning", role: "status" });
     this.answer = h("p", { class: "answer", role: "status" });
     this.list = h("ol", { class: "queue", "aria-label": "Runs to be done, the next one first" });
     this.ended = h("ol", { class: "queue" });
@@ -33,7 +36,7 @@ export class Queue {
       h("div", { class: "stack" },
         h("section", { class: "panel" }, h("h2", {}, "Start a run"), form)),
       h("div", { class: "stack" },
-        h("section", { class: "panel" }, h("h2", {}, "To be done"), this.list, this.answer),
+        h("section", { class: "panel" }, h("h2", {}, "To be done"), this.list, this.answer, this.resumes),
         h("section", { class: "panel" }, h("h2", {}, "Ended"), this.ended))));
     this.load();
   }
@@ -88,6 +91,11 @@ export class Queue {
   }
 
   update(state) {
+    this.show(state);
+    hold_resumes(this.place, this.resumes, state);
+  }
+
+  show(state) {
     const runs = state.queue, key = JSON.stringify(runs);
     if (key === this.shown || this.dragged) return;
     if (this.list.querySelector(".ask")) return;
@@ -102,7 +110,7 @@ export class Queue {
   row(run, movable) {
     const at = movable.indexOf(run), offset_ns = this.app.state.utc_offset_ns;
     const acts = h("span", { class: "row" });
-    const button = (name, label, act, disabled = false) => acts.append(h("button", { type: "button", class: "small", "aria-label": `${label}: run ${run.id}`, disabled, onclick: act }, name));
+    const button = (name, label, act, disabled = false) => acts.append(h("button", { type: "button", class: "small", "data-resume": name === "Resume", "aria-label": `${label}: run ${run.id}`, disabled, onclick: act }, name));
     const row = h("li", { draggable: at >= 0 ? "true" : undefined }, h("span", { class: "number quiet" }, String(run.id)),
       h("span", {}, h("b", {}, run.recipe), ` ${run.state}`, time_of(run),
         h("br"), h("small", {}, [run.reason, run.added_by && `by ${run.added_by}`, `added ${day_clock(seconds(run.added_ns, offset_ns))}`, run.session].filter(Boolean).join(" · "))), acts);
@@ -112,7 +120,7 @@ export class Queue {
       button("Remove", "Remove", () => ask(row, `Take run ${run.id} (${run.recipe}) out of the queue?`, "Remove it", () => command(this.answer, "remove", "DELETE", `/queue/${run.id}`)));
       this.drag(row, run, at);
     }
-    if (["interrupted", "stopped"].includes(run.state) && run.session) button("Resume", "Resume", () => command(this.answer, "resume", "POST", `/sessions/${encodeURIComponent(run.session)}/resume`));
+    if (RESUMABLE.includes(run.state) && run.session) button("Resume", "Resume", () => command(this.answer, "resume", "POST", `/sessions/${encodeURIComponent(run.session)}/resume`));
     return row;
   }
 

@@ -53,7 +53,14 @@ export class RecipeForm {
     return Object.entries(schema.properties).map(([name, each]) => this.field(name, { default: each.default, ...this.resolve(each) }, values[name], schema.required?.includes(name)));
   }
 
+  // What follows from the plan is shown, and nobody types it.
   field(name, schema, value, required) {
+    const made = this.field_of(name, schema, value, required);
+    if (schema.readOnly) for (const input of made.row.querySelectorAll("input, select, textarea")) set_fixed(input, true);
+    return made;
+  }
+
+  field_of(name, schema, value, required) {
     const given = value ?? schema.default;
     if (schema.enum) return choice_field(name, schema.enum, given);
     if (schema.type === "number" || schema.type === "integer") return number_field(name, schema, given, required);
@@ -131,6 +138,11 @@ function nested(made) {
 const long = (value) => (typeof value === "string" ? { [value]: {} } : value);
 
 const is_texts = (schema) => schema.anyOf?.some((each) => each.type === "array" && each.items?.type === "string");
+
+export function set_fixed(input, is_fixed) {
+  if (input.matches("select, [type='checkbox']")) input.disabled = is_fixed;
+  else input.readOnly = is_fixed;
+}
 
 export function collect(fields) {
   return Object.fromEntries(fields.map((each) => [each.name, each.value()]).filter(([, value]) => value !== undefined));

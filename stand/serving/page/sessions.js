@@ -2,10 +2,11 @@
 import { command, get, tell } from "./api.js";
 import { look_of } from "./channels.js";
 import { swatch } from "./now.js";
-import { bytes, css, day_clock, duration, fill, h, seconds } from "./dom.js";
+import { bytes, css, dated_clock, duration, fill, h, hold_resumes, seconds } from "./dom.js";
 import uPlot from "./uPlot.js";
 
 const MOST_ROWS = 200;
+const RESUMABLE = ["interrupted", "stopped", "tripped", "failed"]; // recording/reading/run_word.py
 // A dash says which night: here colours alone tell air from camera, and must be far apart.
 const COMPARED = [["thermometers.air", "--c-granite"], ["camera.temperature", "--c-camera"]];
 
@@ -15,6 +16,7 @@ export class Sessions {
     this.chosen = [];
     this.plots = [];
     this.answer = h("p", { class: "answer", role: "status" });
+    this.resumes = h("p", { class: "level-warning", role: "status" });
     this.rows = h("tbody");
     this.search = h("input", { type: "search", placeholder: "search", "aria-label": "Search sessions by name, recipe, operator or tag", oninput: () => this.show() });
     this.compare_button = h("button", { type: "button", disabled: true, onclick: () => this.compare() }, "Show");
@@ -22,7 +24,7 @@ export class Sessions {
     const head = ["", "session", "recipe", "began", "took", "frames", "size", "run", "files", ""].map((name) => h("th", { scope: "col", class: ["took", "frames", "size"].includes(name) ? "number" : undefined }, name || h("span", { class: "unseen" }, "actions")));
     fill(place, h("div", { class: "stack" },
       this.comparison,
-      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Sessions"), this.search, this.compare_button), this.answer,
+      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Sessions"), this.search, this.compare_button), this.answer, this.resumes,
         this.table = h("div", { class: "scroll", hidden: true }, h("table", { class: "sessions" }, h("thead", {}, h("tr", {}, head)), this.rows)))));
     this.load();
   }
@@ -44,6 +46,7 @@ export class Sessions {
     const none = this.sessions?.length ? "no session matches the search" : "No session is recorded here yet. Each run makes one, and so does each day.";
     tell(this.answer, found.length ? (found.length > MOST_ROWS ? `the latest ${MOST_ROWS} of ${found.length}; the search finds the others` : "") : none);
     this.choose();
+    if (this.app.state) this.update(this.app.state);
   }
 
   row(each) {
@@ -52,13 +55,13 @@ export class Sessions {
     const took = each.begin_ns && each.end_ns ? duration((each.end_ns - each.begin_ns) / 1e9) : "–";
     const path = encodeURIComponent(each.name), actions = h("span", { class: "row" });
     if (each.has_report) actions.append(h("a", { href: `/api/v1/sessions/${path}/report.html`, target: "_blank", rel: "noopener" }, "report"));
-    if (["interrupted", "killed", "aborted", "stopped"].includes(each.run)) actions.append(h("button", { type: "button", class: "small", onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
+    if (RESUMABLE.includes(each.run)) actions.append(h("button", { type: "button", class: "small", "data-resume": "", "aria-label": `Resume ${each.name}`, onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
     actions.append(h("button", { type: "button", class: "small", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
     const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
     return h("tr", {}, h("td", {}, box),
       h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)]),
         (each.notes ?? []).map((note) => h("small", { class: "said" }, `${note.by ? `${note.by}: ` : ""}${note.text ?? note}`))),
-      h("td", {}, each.recipe), h("td", {}, begun_ns(each) ? day_clock(seconds(begun_ns(each))) : "–"), h("td", { class: "number" }, took),
+      h("td", {}, each.recipe), h("td", {}, begun_ns(each) ? dated_clock(seconds(begun_ns(each))) : "–"), h("td", { class: "number" }, took),
       h("td", { class: "number" }, String(each.frames)), h("td", { class: "number" }, bytes(each.bytes ?? 0)), h("td", {}, each.run),
       h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files, each.copies ? h("small", { class: "said" }, each.copies.length ? "archived" : "not archived") : null), h("td", {}, actions));
   }
@@ -148,7 +151,7 @@ export class Sessions {
     this.drift_plot = null;
   }
 
-  update() {}
+  update(state) { hold_resumes(this.rows, this.resumes, state); }
   soon() { this.load(); }
   event(event) { if (["run.end", "reported", "not_reported"].includes(event.kind)) this.load(); }
   close() { this.closed = true; this.clear(); }
