@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from drivers.devices.in_force import InForce
 from drivers.settings import CameraSettings, Identity
 from foundation.readings import Frame, Reading
 
@@ -49,7 +50,12 @@ class Actuator(Device, Protocol):
 
 class Controller(Sensor, Actuator, Protocol):
     """What holds the chamber's temperature: a regulator, or a climate chamber with a controller of its own. Channels
-    pv, sp (degC), running, fault, and where it has outputs mv_heat, mv_cool (%)."""
+    pv, sp (degC), running, fault, and where it has outputs mv_heat, mv_cool (%). A set-point that is not in force is a
+    fault at each `read`, and keeps `set_temperature` and `run` from being obeyed: DeviceFault."""
+
+    async def in_force(self) -> InForce:
+        """Whether the set-point that it has is the one that acts, as it tells now; raises DeviceError."""
+        ...
 
     async def set_temperature(self, degC: float) -> None:
         """Send a set-point and read it back; Refused, or Occupied while a person has it."""

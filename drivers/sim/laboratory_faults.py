@@ -180,6 +180,10 @@ FAULTS: dict[str, Fault] = {
     "regulator.set_point_clamp_degC": Fault(
         _clamp_set_point, (15.0, 30.0), None, "[low, high]: it takes no set-point outside, and acknowledges it"
     ),
+    "regulator.acting_degC": Fault(
+        to("regulator.acting_degC", number_or_none), 45.0, None, "another set-point acts: multi-SP, or the remote one"
+    ),
+    "regulator.ramp_K_per_min": Fault(to("regulator.ramp_K_per_min", number_or_none), 0.5, None, "a ramp of its own"),
     "regulator.stop_key": once("regulator.press_stop", "somebody stops control"),
     "regulator.manual_percent": Fault(_press_manual, 50.0, None, "somebody dials in a heating output"),
     "regulator.autotune": Fault(
@@ -218,6 +222,12 @@ FAULTS: dict[str, Fault] = {
     "chamber.humidity": flag("chamber.humidity_on", "it is on"),
     "chamber.stuck_degC": Fault(to("chamber.stuck_degC", number_or_none), 24.0, None, "its own sensor stays there"),
     "chamber.set_point_degC": Fault(given("chamber.press_setpoint"), 45.0, None, "somebody changes it at the panel"),
+    "chamber.program_degC": Fault(
+        to("chamber.program_degC", number_or_none), 45.0, None, "a program of its own runs, and goes there"
+    ),
+    "chamber.bank": Fault(
+        to("chamber.bank", lambda value: int(number(value))), 1, 0, "working temperature that acts: 0 is T1 (Julabo)"
+    ),
     "chamber.stop_key": once("chamber.press_stop", "somebody stops it"),
     "chamber.restart": once("chamber.restart", "a power failure: it is stopped"),
     # The plant, and the relays.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from drivers.settings import Identity, same_device
 from drivers.wires.bus import Bus
-from drivers.wires.registers import Command, IdentityPoint, Point, PointType, RegisterMap, Space, Split
+from drivers.wires.registers import Command, IdentityPoint, InForceCheck, Point, PointType, RegisterMap, Space, Split
 from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 
 WRITE_TRIES = 2
@@ -189,6 +189,21 @@ def is_confirmed(command: Command, snapshot: Snapshot) -> bool:
     if confirm.equals is not None:
         return snapshot.samples[confirm.point].value == confirm.equals
     return snapshot.bits[confirm.bit] == confirm.is_
+
+
+def objection(check: InForceCheck, snapshot: Snapshot) -> str:
+    """Why the set-point that was written is not the one that acts, by a snapshot that has read the points of the check;
+    "" when this one does not object."""
+    if check.bit:
+        return "" if snapshot.bits[check.bit] == check.is_ else f"{check.says} ({check.bit} is {int(not check.is_)})"
+    found, wanted = snapshot.samples[check.point], check.equals
+    if check.follows:
+        wanted = snapshot.samples[check.follows].value
+    if wanted is None or abs(found.value - wanted) <= (check.within if check.follows else 0.0):
+        return ""
+    shown = found.reason or f"{found.value:g}"
+    beside = f", {check.follows} {wanted:g}" if check.follows else ""
+    return f"{check.says} ({check.point} is {shown}{beside})"
 
 
 def plan_blocks(register_map: RegisterMap, names: Iterable[str]) -> tuple[Block, ...]:

@@ -151,6 +151,32 @@ class Command(Document):
         return (Write(address=self.address, value=self.value),)
 
 
+class InForceCheck(Document):
+    """What has to be so for the set-point that was written to be the one that acts: a bit of a point that `is`, a point
+    that `equals` a value, or one that `follows` another `within` so much. while_running: it says nothing of a unit that
+    is stopped. says: the sentence when it is not so, with what to do at the panel."""
+
+    point: str
+    bit: str = ""
+    is_: bool = Field(default=True, alias="is")
+    equals: float | None = None
+    follows: str = ""
+    within: float = Field(default=0.05, gt=0)
+    while_running: bool = False
+    says: str = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if bool(self.bit) + (self.equals is not None) + bool(self.follows) != 1:
+            raise ValueError("what is in force is told by a bit, by what its point equals, or by the point it follows")
+        return self
+
+    def __str__(self) -> str:
+        if self.follows:
+            return f"{self.point} follows {self.follows}"
+        return f"{self.bit} is {int(self.is_)}" if self.bit else f"{self.point} is {self.equals:g}"
+
+
 class Probe(Document):
     """A point whose value proves that the unit is the one this map describes."""
 
@@ -168,7 +194,8 @@ class IdentityPoint(Document):
 class RegisterMap(Document):
     """All that is known about one kind of unit. `fault_bits`: bits that mean trouble, reported as they are.
     `when_silent`: what to look at when it does not answer. identity: where the unit tells its serial number, model and
-    version; a unit that refuses such a point does not tell it."""
+    version; a unit that refuses such a point does not tell it. in_force: of a regulator, what shows that the set-point
+    written is the one that acts; not_told: what of that no register shows."""
 
     schema_: Literal["regmap/1"] = Field(alias="schema")
     vendor: str
@@ -180,6 +207,8 @@ class RegisterMap(Document):
     identity: dict[Literal["serial_number", "model", "version"], IdentityPoint] = Field(default_factory=dict)
     points: dict[str, Point] = Field(min_length=1)
     fault_bits: tuple[str, ...] = ()
+    in_force: tuple[InForceCheck, ...] = ()
+    not_told: str = ""
     commands: dict[str, Command] = Field(default_factory=dict)
     startup: tuple[str, ...] = ()
     safe_state: tuple[str, ...] = ()
@@ -219,6 +248,14 @@ class RegisterMap(Document):
         )
         for key, points in named:
             yield from (f"{key}: no point {point}" for point in points if point not in self.points)
+        for each in self.in_force:
+            yield from (
+                f"in_force: no point {name}"
+                for name in (each.point, each.follows or each.point)
+                if name not in self.points
+            )
+            if each.bit and each.bit not in bits:
+                yield f"in_force: no bit {each.bit}"
         for name, command in self.commands.items():
             confirm, point = command.confirm, self.points.get(command.confirm.point)
             if confirm.equals is not None and point is None:

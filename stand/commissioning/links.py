@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, is_dataclass
 from typing import Any, cast
 
-from drivers.devices.protocols import Camera, Device, Sensor
+from drivers.devices.protocols import Camera, Controller, Device, Sensor
 from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from drivers.devices.relays import CAMERA_POWER, HEAT
 from drivers.settings import OnBus
@@ -65,10 +65,30 @@ class Links:
         else:
             readings = await self._unit(regulator, unit)
             await self._points(regulator.name, "regulator", unit)
+        if regulator.name in self.opened:
+            await self._in_force(regulator)
         if readings.get(f"{regulator.name}.running") == 1:
             self._warn(
                 regulator.name, "it controls, though no program has this stand", "stop it, unless you want it so"
             )
+
+    async def _in_force(self, regulator: Controller) -> None:
+        """Whether what is written to it is what it goes to, and how that is known."""
+        try:
+            found = await regulator.in_force()
+        except DeviceError as error:
+            self._add(Finding(regulator.name, "in force", "failed", error.text, "look at the unit"))
+            return
+        data, known = asdict(found), f"known by: {found.known_by}" if found.known_by else "not known: nothing tells it"
+        if found.objections:
+            text = f"its set-point is not in force: {'; '.join(found.objections)}"
+            self._add(Finding(regulator.name, "in force", "failed", text, "nothing is heated until it is", data))
+        elif found.not_told:
+            self._add(
+                Finding(regulator.name, "in force", "unverified", known, f"it does not tell {found.not_told}", data)
+            )
+        else:
+            self._add(Finding(regulator.name, "in force", "ok", known, data=data))
 
     async def thermometers(self) -> None:
         """The module, each thermometer, and all of them against each other."""

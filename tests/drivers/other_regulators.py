@@ -102,7 +102,8 @@ class _Regulator:
 class FakeEurotherm(_Regulator):
     """3200 series: integers in 0.1 degC. Powers up in automatic at its local set point (`local_degC`, EEPROM). A remote
     set point that is not refreshed for 10 s is given up, with its bit in the status. Manual begins with the output that
-    automatic had. Faults: sensor_break; loop_break; lost (the next write to this register never arrives)."""
+    automatic had. Faults: rate_K_per_min (a ramp of its own); sensor_break; loop_break; lost (the next write to this
+    register never arrives)."""
 
     def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
         super().__init__(plant, clock, unit)
@@ -111,6 +112,8 @@ class FakeEurotherm(_Regulator):
         self.loop_break = False
         self.lost: int | None = None
         self.manual = False
+        self.rate_K_per_min: float | None = None
+        self._ramped_degC = self.local_degC
         self._remote_degC = 0.0
         self._remote_since_ns: int | None = None
         self._remote_selected = False
@@ -123,7 +126,14 @@ class FakeEurotherm(_Regulator):
         return since_ns is not None and self._now_ns - since_ns <= REMOTE_FALLS_BACK_s * NS_PER_S
 
     def _setpoint_degC(self) -> float:
-        return self._remote_degC if self._remote_selected and self._remote_lives else self.local_degC
+        target_degC = self._remote_degC if self._remote_selected and self._remote_lives else self.local_degC
+        return target_degC if self.rate_K_per_min is None else self._ramped_degC
+
+    def _on_step(self, time_ns: int, dt_s: float) -> None:
+        super()._on_step(time_ns, dt_s)
+        if self.rate_K_per_min is not None:
+            step_K = self.rate_K_per_min * dt_s / 60
+            self._ramped_degC += max(-step_K, min(step_K, self._remote_degC - self._ramped_degC))
 
     def _output_percent(self) -> float:
         if self.manual or self.sensor_break:
@@ -180,7 +190,7 @@ class FakeEurotherm(_Regulator):
 
 class _Watlow(_Regulator):
     """Floats of two words, low word first; a set point is saved to EEPROM while saving is on. high_first: a gateway
-    that gives the high word first."""
+    that gives the high word first. profile_degC: a profile runs, and goes there."""
 
     MODE, SETPOINT, OUTPUT, PV = 0, 0, 0, 0
 
@@ -191,9 +201,14 @@ class _Watlow(_Regulator):
         self.saving = True
         self.high_first = False
         self.limits_degC = (-70.0, 180.0)
+        self.profile_degC: float | None = None
+
+    @property
+    def acting_degC(self) -> float:
+        return self.setpoint_degC if self.profile_degC is None else self.profile_degC
 
     def _output_percent(self) -> float:
-        return self._towards(self.setpoint_degC) if self.mode == AUTOMATIC else 0.0
+        return self._towards(self.acting_degC) if self.mode == AUTOMATIC else 0.0
 
     def _floats(self) -> dict[int, float]:
         return {self.PV: self._pv_degC(), self.SETPOINT: self.setpoint_degC, self.OUTPUT: self._output_percent()}
@@ -246,7 +261,7 @@ class FakeF4t(_Watlow):
 
     def _floats(self) -> dict[int, float]:
         low_degC, high_degC = self.limits_degC
-        return {**super()._floats(), 2774: low_degC, 2776: high_degC, 2810: self.setpoint_degC}
+        return {**super()._floats(), 2774: low_degC, 2776: high_degC, 2810: self.acting_degC}
 
 
 class FakeBinder(_Watlow):
@@ -261,10 +276,10 @@ class FakeBinder(_Watlow):
         self.door_open = False
 
     def _output_percent(self) -> float:
-        return self._towards(self.setpoint_degC) if self.mode == self.BY_HAND else 0.0
+        return self._towards(self.acting_degC) if self.mode == self.BY_HAND else 0.0
 
     def _floats(self) -> dict[int, float]:
-        return {self.PV: self._pv_degC(), self.SETPOINT: self.setpoint_degC, 0x156F: 22.0}
+        return {self.PV: self._pv_degC(), self.SETPOINT: self.setpoint_degC, 0x156F: 22.0, 0x1077: self.acting_degC}
 
     def _whole(self) -> dict[int, int]:
         return {self.MODE: self.mode, 0x1007: int(self.door_open)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -163,7 +164,9 @@ async def test_a_circulator_that_is_operated_by_hand_is_not_used_and_the_panel_a
         await bench.driver.set_temperature(30.0)
         bench.fake.remote = False
         for call in (bench.driver.set_temperature(40.0), bench.driver.run()):
-            with pytest.raises(Refused, match=r"operated by hand: choose remote control \(RS232, USB\) at its panel"):
+            with pytest.raises(
+                DeviceFault, match=r"operated by hand: choose remote control \(RS232, USB\) at its panel"
+            ):
                 await call
         assert (bench.fake.setpoint_degC, bench.fake.running) == (30.0, False)
         bench.fake.remote = True
@@ -181,13 +184,77 @@ async def test_a_circulator_says_what_it_did_not_take_and_that_is_no_alarm(tmp_p
         assert (await bench.read())["fault"].value == 0
 
 
-async def test_a_chamber_in_a_program_of_its_own_is_not_started(tmp_path: Path):
-    async with bench_of("simserv", "tcp", tmp_path) as bench:
+IN_FORCE = [  # of which make, with which settings, what acts in the place of the set-point, and what is said of it
+    ("julabo", {}, {"bank": 1}, "working temperature T2 acts (in_mode_01 is 1), and T1 is set"),
+    ("julabo", {}, {"bank": 2}, "working temperature T3 acts"),
+    ("julabo", {}, {"external": True}, "external control is on (in_mode_04 is 1)"),
+    ("julabo", {}, {"degF": True}, "in degF (in_sp_06 is 1)"),
+    ("julabo", {}, {"remote": False}, "operated by hand: choose remote control (RS232, USB) at its panel"),
+    ("espec", {}, {"program_degC": 50.0}, "a program of its own runs; end it at the panel"),
+    ("simserv", {}, {"program_degC": 50.0}, "a program of its own runs; end it at the panel"),
+    ("simserv", {}, {"gradient_K_per_min": 0.5}, "a gradient of 0.5 K/min upwards is set (11066)"),
+    ("cts", {}, {"program_degC": 50.0}, "a program of its own runs; end it at the panel (number 2)"),
+    ("cts", {"ramp_reply": 23}, {"ramps": True}, "a ramp of its own runs (R1)"),
+]
+
+
+@pytest.mark.parametrize(("make", "settings", "state", "said"), IN_FORCE)
+async def test_a_set_point_that_is_not_the_one_that_acts_is_a_fault_and_is_not_heated_for(
+    make: str, settings: dict[str, object], state: dict[str, object], said: str, tmp_path: Path
+):
+    async with bench_of(make, "tcp", tmp_path, **settings) as bench:
         await bench.driver.open()
-        bench.fake.in_program = True
-        assert (await bench.read())["fault"].reason == "a program of its own runs"
-        with pytest.raises(DeviceFault, match="a program of its own runs; end it at the panel"):
-            await bench.driver.run()
+        await bench.driver.set_temperature(30.0)
+        found = await bench.driver.in_force()
+        assert (found.objections, bool(found.known_by)) == ((), True)
+        for name, value in state.items():
+            setattr(bench.fake, name, value)
+        written = bench.fake.setpoint_writes
+        (objection,) = (await bench.driver.in_force()).objections
+        assert said in objection
+        for call in (bench.driver.set_temperature(40.0), bench.driver.run()):
+            with pytest.raises(DeviceFault, match=f"its set-point is not in force: .*{re.escape(said)}"):
+                await call
+        assert (bench.fake.setpoint_writes, bench.fake.running) == (written, False)
+        found = await bench.read()
+        assert (found["fault"].value, said in found["fault"].reason) == (1, True)
+
+
+@pytest.mark.parametrize("make", ["julabo", "espec", "simserv", "cts", "ascii2"])
+async def test_what_is_changed_at_the_panel_while_it_controls_is_seen_at_the_next_poll(make: str, tmp_path: Path):
+    """Of ASCII-2 the nominal value alone tells it."""
+    async with running_at_30_degC(make, tmp_path) as bench:
+        assert (await bench.read())["fault"].value == 0
+        setattr(bench.fake, *(("bank", 1) if make == "julabo" else ("program_degC", 50.0)))
+        bench.wait(3600.0)
+        assert bench.plant.chamber_degC > 40  # it has gone elsewhere, with its set-point as it was written
+        assert (await bench.read())["fault"].value == 1
+        await bench.driver.stop()
+
+
+@pytest.mark.parametrize("answers", [False, True])
+async def test_a_circulator_with_one_working_temperature_says_so_once_and_is_used(answers: bool, tmp_path: Path):
+    async with bench_of("julabo", "tcp", tmp_path, timeout_s=0.2) as bench:
+        bench.fake.unknown, bench.fake.answers_unknown = ("in_mode_01", "in_sp_06"), answers
+        await bench.driver.open()
+        await bench.driver.set_temperature(30.0)
+        await bench.driver.run()
+        assert (await bench.read())["fault"].value == 0
+        found = await bench.driver.in_force()
+        assert "in_mode_04" in found.known_by
+        assert "in_mode_01" not in found.known_by
+        assert "which working temperature acts" in found.not_told
+        bench.fake.external = True
+        assert (await bench.read())["fault"].value == 1
+
+
+async def test_a_gradient_that_is_wanted_and_one_that_a_unit_does_not_know_are_no_fault(tmp_path: Path):
+    for settings, K_per_min in (({"allows_gradient": True}, 0.5), ({}, None)):
+        async with bench_of("simserv", "tcp", tmp_path, **settings) as bench:
+            bench.fake.gradient_K_per_min = K_per_min
+            await bench.driver.open()
+            await bench.driver.set_temperature(30.0)
+            assert (await bench.driver.in_force()).objections == ()
 
 
 async def test_a_temperature_that_looks_like_a_code_is_a_temperature(tmp_path: Path):

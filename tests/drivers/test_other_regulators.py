@@ -173,7 +173,51 @@ async def test_a_remote_set_point_that_is_not_refreshed_is_given_up_for_the_loca
         bench.wait(5.0)
         assert bench.plant.heater_on_fraction == 0  # its local set-point is 20 degC
         found = by_name(await regulator.read())
-        assert found["fault"].reason == "remote_sp_fail"
+        assert found["fault"].reason.startswith("remote_sp_fail, another set-point acts")
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "value"),
+    [
+        ("eurotherm-3200", "rate_K_per_min", 0.5),
+        ("watlow-f4t", "profile_degC", 60.0),
+        ("binder-mk53", "profile_degC", 60.0),
+        ("watlow-ez-zone", "comms_unit", 30),
+    ],
+)
+async def test_a_set_point_that_is_not_the_one_that_acts_stops_what_was_started(make: str, name: str, value: float):
+    bench = Bench(make)
+    async with driven(bench, map_of(make)) as regulator:
+        await regulator.open()
+        await regulator.stop()
+        await regulator.set_temperature(30.0)
+        found = await regulator.in_force()
+        assert (found.objections, bool(found.known_by), bool(found.not_told)) == ((), True, True)
+        setattr(bench.fake, name, value)
+        bench.wait(5.0)
+        with pytest.raises(DeviceFault, match="its set-point is not in force: "):
+            await regulator.run()
+        bench.wait(1.0)
+        assert bench.plant.heater_on_fraction == 0
+        setattr(bench.fake, name, DEGC if name == "comms_unit" else None)
+        await regulator.set_temperature(30.0)
+        await regulator.run()
+        assert by_name(await regulator.read())["fault"].value == 0
+        setattr(bench.fake, name, value)
+        bench.wait(5.0)
+        assert by_name(await regulator.read())["fault"].value == 1
+
+
+async def test_a_map_that_does_not_say_what_is_in_force_is_known_as_such():
+    def without(text: str) -> str:
+        document = yaml.safe_load(text)
+        del document["in_force"], document["not_told"]
+        return yaml.safe_dump(document)
+
+    async with driven(Bench("watlow-f4t"), map_of("watlow-f4t", without)) as regulator:
+        await regulator.open()
+        found = await regulator.in_force()
+        assert (found.known_by, found.not_told) == ("", "its register map has no in_force")
 
 
 async def test_eurotherm_sensor_break_makes_the_pv_bad():

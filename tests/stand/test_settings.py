@@ -54,6 +54,7 @@ def classes(*packages: ModuleType) -> set[type]:
 
 
 REGISTER_MAP = {
+    "InForceCheck",
     "RegisterMap",
     "Transport",
     "RawFault",

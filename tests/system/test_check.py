@@ -12,17 +12,22 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from foundation.clock import WallClock
 from foundation.documents import read_document
-from foundation.errors import InUse
+from foundation.errors import DeviceFault, InUse
+from foundation.hub import Hub
+from stand.assembly import assemble
 from stand.commands.check_cli import app
 from stand.commissioning.commissioning import commission
 from stand.commissioning.finding import Finding
 from stand.config.checked import doubt, load_checked
 from stand.config.stand_config import load_config
 from stand.running.opening.claim import claimed
-from stand.running.opening.stop import Interrupted
+from stand.running.opening.open_stand import opened
+from stand.running.opening.stop import Interrupted, Stop
 from stand.running.order import Order, load_order, register_texts
 from stand.simulator import ControlSocket, Simulator
+from tests.addresses import free_port
 from tests.system.conftest import require_aravis
 
 
@@ -115,6 +120,32 @@ def test_what_is_wrong_is_said_of_its_device_and_keeps_none_of_the_others(config
     record = load_checked(config)
     assert record is not None
     assert record.failed == 4
+
+
+def test_a_set_point_that_would_not_be_in_force_is_found_and_no_run_begins_with_it(
+    tmp_path: Path, config_text: Callable[..., str], simulator: Callable[..., Simulator]
+) -> None:
+    data = yaml.safe_load(config_text(axes={}))
+    del data["regulator"], data["relays"], data["axes"]["linear"], data["axes"]["rotary"]
+    address = f"tcp:127.0.0.1:{free_port()}"
+    limits: dict[str, object] = {"limits_at_panel_degC": [-10, 60], "gap_s": 0.0, "poll_s": 0.5}
+    data["climate_chamber"] = {"protocol": "julabo", "address": address, **limits}
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(data))
+    simulator(load_config(config), False)
+    _, findings = check(config)
+    assert ("regulator", "in force") in verdicts(findings, "ok")
+    laboratory(config, {"do": "fault", "name": "chamber.bank", "value": 1})
+    status, findings = check(config)
+    assert (status, ("regulator", "in force") in verdicts(findings, "failed")) == (1, True)
+
+    async def run() -> None:
+        assembly = assemble(load_config(config), Hub(), WallClock())
+        async with Stop() as stop, opened(assembly, None, stop, is_for_one=True):
+            pytest.fail("it is open")
+
+    with pytest.raises(DeviceFault, match="its set-point is not in force: working temperature T2 acts"):
+        asyncio.run(run())
 
 
 def test_with_moves_timer_flap_and_camera_are_measured_and_all_is_as_before(config: Path) -> None:

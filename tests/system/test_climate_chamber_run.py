@@ -79,16 +79,25 @@ async def test_a_stand_with_a_commercial_chamber_needs_no_relay_board(
     assert len(session.frame_metas) == 3
 
 
-async def test_a_set_point_changed_at_its_panel_holds_the_run(tmp_path: Path, chamber_order: Callable[..., Order]):
-    ordered, out, watcher = chamber_order("espec", recipe=LONG_SOAK), tmp_path / "out", Watcher()
+@pytest.mark.parametrize(
+    ("make", "name", "value", "said"),
+    [
+        ("espec", "chamber.set_point_degC", 45, "set point changed at the unit, from "),
+        ("julabo", "chamber.bank", 1, "working temperature T2 acts"),
+    ],
+)
+async def test_a_set_point_changed_at_its_panel_holds_the_run(
+    tmp_path: Path, chamber_order: Callable[..., Order], make: str, name: str, value: int, said: str
+):
+    ordered, out, watcher = chamber_order(make, recipe=LONG_SOAK), tmp_path / "out", Watcher()
 
     async def operate() -> None:
         await watcher.event("run.start", 60)
         (directory,) = out.iterdir()
         await watcher.wait(1800)
-        await fault(ordered, "chamber.set_point_degC", 45)
+        await fault(ordered, name, value)
         trip = await watcher.event("guard.device_fault", 300)
-        assert "set point changed at the unit, from " in trip.text
+        assert said in trip.text
         await asyncio.to_thread(ask, directory, "stop")
 
     await run_operated(ordered, out, watcher, operate())

@@ -40,6 +40,12 @@ def number(value: float) -> str:
 class Language(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
+    in_force_by = "the nominal value in the reply to I, which a program moves"
+    not_told = (
+        "whether a program runs that has not moved it yet, whether EXTERN is on before something is written, a ramp "
+        "whose target it shows, and the unit of temperatures, which the stand compares with its own thermometer"
+    )
+
     def __init__(self, name: str, settings: Ascii2Settings) -> None:
         super().__init__(name, settings, SerialSettings(settings.baud, 1))
         self._settings = settings

@@ -1,6 +1,7 @@
 """CTS (ITC, Cadimac): short ASCII commands, framed on RS-232, bare over TCP. Source: the maker's interface manual.
 
 A0  -> A0 024.5 025.0      actual and set temperature          a0 025.0 -> a     s1 1 -> s1     s1 0 -> s1
+P   -> P002, the program that runs, 000 for none                R1  -> R1 ab up down end: a active, b running
 O   -> O, start, error, unused, flags (x4: door closed); its length differs from unit to unit
 S   -> S, run, error, not paused, humidity on, 4 more, code    F -> F and 32 characters of error text
 framed: STX, 80+address, text, CHK, ETX; between STX and ETX every byte has bit 7 set, CHK = XOR of address and text
@@ -9,12 +10,12 @@ framed: STX, 80+address, text, CHK, ETX; between STX and ETX every byte has bit 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import reduce
 from operator import xor
 from typing import TypeVar
 
-from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
+from drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
 from drivers.devices.chambers.chamber_settings import CtsSettings
 from drivers.wires.link import SerialSettings
 from foundation.errors import Refused
@@ -25,6 +26,7 @@ _STX, _ETX, _HIGH = 0x02, 0x03, 0x80
 _TEMPERATURES = re.compile(r"A0 (-?\d{2,3}\.\d) (-?\d{2,3}\.\d)")
 _STATE = re.compile(r"S([01?]{8})(.)", re.DOTALL)
 _DOOR_CLOSED = 0x04
+_NO_PROGRAM = 0
 _NO_ERROR = {0x00, 0x30}  # code bytes
 
 
@@ -49,11 +51,20 @@ def unframed(unit: int, heard: bytes) -> str | None:
 class Language(ChamberLanguage):
     """One CTS chamber."""
 
+    not_told = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
+
     def __init__(self, name: str, settings: CtsSettings) -> None:
         super().__init__(name, settings, SerialSettings(settings.baud, 1, settings.parity))
         self._unit = settings.unit
         self._door_reply = settings.door_reply
+        self._program_reply, self._ramp_reply = settings.program_reply, settings.ramp_reply
         self._is_serial = settings.address.startswith("serial:")
+        asked = {"P whether a program runs": settings.program_reply, "R1 whether a ramp does": settings.ramp_reply}
+        self.in_force_by = ", ".join(
+            ("A0 tells the set-point", *(text for text, is_asked in asked.items() if is_asked))
+        )
+        if unasked := [text for text, is_asked in asked.items() if not is_asked]:
+            self.not_told = f"{', '.join(unasked)} (not asked); {self.not_told}"
 
     def state(self) -> ChamberState:
         """Of A0, S, and F when there is an error."""
@@ -64,7 +75,13 @@ class Language(ChamberLanguage):
             alarms = (*alarms, "it is paused")
         is_open = self._door_reply is not None and self.client.query(*self._asked("O", self._door_reply, _door_open))
         return ChamberState(
-            actual, nominal, flags[0] == "1", alarms, humidity_on=flags[3] == "1", door_open=bool(is_open)
+            actual,
+            nominal,
+            flags[0] == "1",
+            alarms,
+            humidity_on=flags[3] == "1",
+            door_open=bool(is_open),
+            objections=tuple(self._objections()),
         )
 
     def set_temperature(self, degC: float) -> None:
@@ -78,6 +95,14 @@ class Language(ChamberLanguage):
     def run(self, on: bool) -> None:
         """s1 1 or s1 0."""
         self.client.send(*self._asked(f"s1 {int(on)}", 2, _expecting("s1")))
+
+    def _objections(self) -> Iterator[str]:
+        if self._program_reply is not None:
+            number = self.client.query(*self._asked("P", self._program_reply, _program))
+            if number != _NO_PROGRAM:
+                yield f"{PROGRAM} (number {number})"
+        if self._ramp_reply is not None and self.client.query(*self._asked("R1", self._ramp_reply, _ramps)):
+            yield "a ramp of its own runs (R1), and the set-point is reached only by it; end it at the panel"
 
     def _error_text(self, code: str) -> str:
         text = self.client.query(*self._asked("F", 33, lambda text: text[1:].strip() if text[:1] == "F" else None))
@@ -108,6 +133,15 @@ class Language(ChamberLanguage):
             return found
 
         return framed(self._unit, text) if self._is_serial else text.encode("ascii"), answer
+
+
+def _program(text: str) -> int | None:
+    return int(text[1:]) if text[:1] == "P" and text[1:].isdecimal() else None
+
+
+def _ramps(text: str) -> bool | None:
+    found = re.match(r"R1 ([01])([01]) ", text)
+    return found[2] == "1" if found else None
 
 
 def _door_open(text: str) -> bool | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, whole_line
+from drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState, whole_line
 from drivers.devices.chambers.chamber_settings import EspecSettings
 from drivers.wires.link import SerialSettings
 from foundation.errors import GarbledReply, Refused
@@ -29,6 +29,9 @@ def _numbers(text: str, count: int) -> list[float]:
 
 class Language(ChamberLanguage):
     """One ESPEC chamber."""
+
+    in_force_by = "TEMP? tells the set-point that acts, MON? whether a program runs"
+    not_told = "the unit of temperatures, which the stand compares with its own thermometer"
 
     def __init__(self, name: str, settings: EspecSettings) -> None:
         super().__init__(name, settings, SerialSettings(settings.baud, 1))
@@ -60,7 +63,7 @@ class Language(ChamberLanguage):
             _MODES[word],
             tuple(f"alarm {code.strip()}" for code in codes),
             self._humidity_on() if humidity else None,
-            program=word == "RUN",
+            objections=(PROGRAM,) if word == "RUN" else (),
         )
 
     def set_temperature(self, degC: float) -> None:

@@ -3,23 +3,36 @@ SL, Presto and Magio (interface commands, status and error messages).
 
 in_pv_00 -> 24.6        in_sp_00 -> 25.0        in_mode_05 -> 0 or 1      status -> 03 REMOTE START, -01 LOW LEVEL ALARM
 out_sp_00 25.0          out_mode_05 1           commands end with CR; the replies with LF, and out has none
+in_mode_01 -> 0, 1, 2: T1, T2, T3 acts (sp_00 is T1)       in_mode_04 -> 0 internal, 1 external control
+in_sp_06 -> 0 degC, 1 degF on some FP51-SL                 a unit without one of these answers -08, or not at all
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, whole_line
 from drivers.devices.chambers.chamber_settings import JulaboSettings
 from drivers.wires.link import SerialSettings
-from foundation.errors import GarbledReply, Refused
+from foundation.errors import GarbledReply, Refused, Unreachable
 
 _NUMBER = re.compile(r"-?\d{1,3}\.\d{1,2}")
 _STATUS = re.compile(r"(-?\d{2}) ([ -~]{1,80})")
 _MANUAL = {"00", "01"}
 _REMOTE = {"02", "03"}
 _ABOUT_A_COMMAND = {"-08", "-09", "-10", "-11", "-13"}  # of the last one; the others are alarms and warnings
+_UNKNOWN = "-08"
+_TOLD = {
+    "in_mode_01": "which working temperature acts",
+    "in_mode_04": "whether a sensor outside is controlled",
+    "in_sp_06": "whether temperatures are in degC",
+}
 _BY_HAND = "it is operated by hand: choose remote control (RS232, USB) at its panel"
+_EXTERNAL = (
+    "external control is on (in_mode_04 is 1), so its set-point is of another sensor; choose internal at its panel"
+)
+_DEGF = "its temperatures are in degF (in_sp_06 is 1); choose degC at its panel"
 
 
 def number_of(heard: bytes) -> float | None:
@@ -47,6 +60,20 @@ class Language(ChamberLanguage):
 
     def __init__(self, name: str, settings: JulaboSettings) -> None:
         super().__init__(name, settings, SerialSettings(settings.baud, 1, settings.parity, settings.databits))
+        wanted = {
+            "in_mode_01": settings.asks_bank,
+            "in_mode_04": settings.asks_control,
+            "in_sp_06": settings.asks_unit,
+        }
+        self._asked = [query for query, is_asked in wanted.items() if is_asked]
+        self._say()
+
+    def _say(self) -> None:
+        """What is told by the queries that this unit answers, and what is left open by the others."""
+        texts = [f"{query} tells {text}" for query, text in _TOLD.items() if query in self._asked]
+        self.in_force_by = ", ".join((*texts, "status tells whether it is operated by hand"))
+        unknown = [text for query, text in _TOLD.items() if query not in self._asked]
+        self.not_told = f"{', '.join(unknown)}: compare with its panel" if unknown else ""
 
     def identity(self) -> str:
         """The reply to `version`."""
@@ -64,7 +91,7 @@ class Language(ChamberLanguage):
             self.client.query(b"in_sp_00\r", number_of),
             mode == "1",
             (f"{code} {words}",) if is_alarm else (),
-            by_hand=_BY_HAND if code in _MANUAL else "",
+            objections=tuple(self._objections(code)),
         )
 
     def set_temperature(self, degC: float) -> None:
@@ -77,6 +104,37 @@ class Language(ChamberLanguage):
     def run(self, on: bool) -> None:
         """out_mode_05 1 or 0."""
         self._tell(f"out_mode_05 {int(on)}")
+
+    def _objections(self, code: str) -> Iterator[str]:
+        if code in _MANUAL:
+            yield _BY_HAND
+        bank = self._mode("in_mode_01")
+        if bank not in ("", "0"):
+            name = f"T{int(bank) + 1}" if bank in ("1", "2") else "of another number"
+            yield f"working temperature {name} acts (in_mode_01 is {bank}), and T1 is set; choose T1 at its panel"
+        control = self._mode("in_mode_04")
+        if control not in ("", "0"):
+            yield _EXTERNAL
+        if self._mode("in_sp_06") == "1":
+            yield _DEGF
+
+    def _mode(self, query: str) -> str:
+        """A setting that not every unit has; "" when it does not know it, twice, and then it is not asked again."""
+        for _ in range(2 if query in self._asked else 0):
+            try:
+                answer = self.client.query(f"{query}\r".encode("ascii"), whole_line).strip()
+            except Unreachable:  # -08 may be in the status only
+                if self._status()[0] != _UNKNOWN:
+                    raise
+                continue
+            if answer.isdecimal():
+                return answer
+            if not (answer.startswith(_UNKNOWN) or query == "in_sp_06"):  # which is a temperature or pressure elsewhere
+                raise GarbledReply(self._name, f"{query} was answered by {answer!r}")
+        if query in self._asked:
+            self._asked.remove(query)
+            self._say()
+        return ""
 
     def _status(self) -> tuple[str, str]:
         code, words = self.client.query(b"status\r", status_of)

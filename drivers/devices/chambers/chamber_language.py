@@ -13,18 +13,20 @@ from drivers.wires.link import SerialSettings
 @dataclass(frozen=True, slots=True)
 class ChamberState:
     """One look: temperatures in degC, whether it controls, its alarms in words; `humidity_on`: None when that is
-    unknown; program: a program of its own runs; door_open: False where it does not say. ramp_degC: the set-point on
-    its way, None when it does not move."""
+    unknown; door_open: False where it does not say. ramp_degC: the set-point on its way, None when it does not move.
+    objections: a sentence for each thing that acts in the place of its set-point."""
 
     actual_degC: float
     set_degC: float
     running: bool
     alarms: tuple[str, ...] = ()
     humidity_on: bool | None = None
-    program: bool = False
     ramp_degC: float | None = None
     door_open: bool = False
-    by_hand: str = ""
+    objections: tuple[str, ...] = ()
+
+
+PROGRAM = "a program of its own runs; end it at the panel"
 
 
 class ChamberLanguage(ABC):
@@ -32,11 +34,14 @@ class ChamberLanguage(ABC):
     does not have something leaves that as it is here.
 
     client: of its requests. resolution_K: of a set-point. dead_man: what ends the heat when this computer dies, in
-    words.
+    words. in_force_by, not_told: by which queries `state` knows that its set-point is the one that acts, and what they
+    leave open.
     """
 
     resolution_K = 0.1
     dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
+    in_force_by = ""
+    not_told = ""
 
     def __init__(self, name: str, settings: ChamberUnitSettings, line: SerialSettings) -> None:
         self._name = name

@@ -34,13 +34,17 @@ class EspecSettings(ChamberUnitSettings):
 
 class CtsSettings(ChamberUnitSettings):
     """CTS (ITC, Cadimac): framed ASCII on RS-232 (19200 8O1), bare text over TCP (port 1080). door_reply: how many
-    characters this unit's reply to O has, whose flags tell whether its door is closed; none: it is not asked."""
+    characters this unit's reply to O has, whose flags tell whether its door is closed; none: it is not asked.
+    program_reply, ramp_reply: the same of P, the number of the program that runs, and of R1, its ramp, whose length no
+    manual at hand states."""
 
     protocol: Literal["cts"]
     unit: int = Field(default=1, ge=1, le=32)
     baud: int = Field(default=19200, ge=1200, le=115200)
     parity: Literal["N", "E", "O"] = "O"
     door_reply: int | None = Field(default=None, ge=5, le=64)
+    program_reply: int | None = Field(default=4, ge=2, le=8)
+    ramp_reply: int | None = Field(default=None, ge=6, le=64)
 
 
 class Ascii2Settings(ChamberUnitSettings):
@@ -75,13 +79,14 @@ class Ascii2Settings(ChamberUnitSettings):
 class SimservSettings(ChamberUnitSettings):
     """Weiss and Voetsch with SIMPAC or LabEvent: SIMSERV over TCP (port 2049). chamber: its number there.
     start_channel, off_channels: digital channels, as `14001` counts them; the off_channels (humidity, condensation) are
-    set to 0 at each start."""
+    set to 0 at each start. allows_gradient: one that is set at the unit is wanted; it is not asked for then."""
 
     protocol: Literal["simserv"]
     address: Annotated[ByteAddress, Field(pattern="^tcp:")]
     chamber: int = Field(default=1, ge=1, le=99)
     start_channel: int = Field(default=1, ge=0, le=99)
     off_channels: tuple[Annotated[int, Field(ge=0, le=99)], ...] = ()
+    allows_gradient: bool = False
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
@@ -92,13 +97,19 @@ class SimservSettings(ChamberUnitSettings):
 
 class JulaboSettings(ChamberUnitSettings):
     """A Julabo circulator or temperature system whose bath holds the chamber: RS-232 (older ones 4800 7E1), USB or TCP.
-    Its set-point is the bath's, not the air's."""
+    Its set-point is the bath's, not the air's. asks_bank, asks_control, asks_unit: whether in_mode_01 (which working
+    temperature acts), in_mode_04 (whether a sensor outside is controlled) and in_sp_06 are asked. in_sp_06 is the unit
+    of temperatures on some FP51-SL only (0 degC, 1 degF); on a unit where it is another value that may be a bare 1, do
+    not ask."""
 
     protocol: Literal["julabo"]
     baud: int = Field(default=4800, ge=1200, le=115200)
     parity: Literal["N", "E", "O"] = "E"
     databits: Literal[7, 8] = 7
     gap_s: float = Field(default=0.25, ge=0, le=5)  # asked for by the manuals
+    asks_bank: bool = True
+    asks_control: bool = True
+    asks_unit: bool = True
 
 
 ClimateChamberSettings = Annotated[

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
+from drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
 from drivers.devices.chambers.chamber_settings import SimservSettings
 from drivers.wires.link import SerialSettings
 from foundation.errors import GarbledReply, Refused
@@ -29,6 +29,7 @@ _RUNNING, _ALARM = 2, 8  # bits of 10012
 _IN_PROGRAM = "4"  # of 10010
 _MOST_MESSAGES = 50
 _ALARM_MESSAGE = "1"  # of 17005
+_GRADIENTS = {11066: "upwards", 11070: "downwards"}  # K/min, 0 for none
 
 
 def reply_of(heard: bytes) -> tuple[str, list[str]] | None:
@@ -44,6 +45,9 @@ def reply_of(heard: bytes) -> tuple[str, list[str]] | None:
 
 class Language(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
+
+    in_force_by = "11002 tells the set-point, 10010 whether a program runs, 11066 and 11070 whether a gradient is set"
+    not_told = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
 
     def __init__(self, name: str, settings: SimservSettings) -> None:
         super().__init__(name, settings, SerialSettings(9600, 1))  # the line is of no meaning over TCP
@@ -67,7 +71,7 @@ class Language(ChamberLanguage):
             bool(flags & _RUNNING) or self._is_on(self._settings.start_channel),
             self._alarms() if flags & _ALARM else (),
             humidity_on=any(self._is_on(channel) for channel in self._settings.off_channels),
-            program=self._text(10010) == _IN_PROGRAM,
+            objections=(*((PROGRAM,) if self._text(10010) == _IN_PROGRAM else ()), *self._gradients()),
         )
 
     def set_temperature(self, degC: float) -> None:
@@ -80,8 +84,27 @@ class Language(ChamberLanguage):
             self._tell(14001, channel, 0)
 
     def run(self, on: bool) -> None:
-        """The start channel."""
+        """The start channel; a program of its own goes on without it, and is ended first."""
+        if not on and self._text(10010) == _IN_PROGRAM:
+            self._tell(19015)
         self._tell(14001, self._settings.start_channel, int(on))
+
+    def _gradients(self) -> tuple[str, ...]:
+        """Those that are set; a unit that has none refuses the question."""
+        if self._settings.allows_gradient:
+            return ()
+        found: list[str] = []
+        for command, way in _GRADIENTS.items():
+            try:
+                K_per_min = self._number(command, _TEMPERATURE)
+            except Refused:
+                continue
+            if K_per_min > 0:
+                found.append(
+                    f"a gradient of {K_per_min:g} K/min {way} is set ({command}), and the set-point is reached only by "
+                    "it; set it to 0 at the panel, or allow it by allows_gradient"
+                )
+        return tuple(found)
 
     def _alarms(self) -> tuple[str, ...]:
         """The texts of the alarms that stand, of all its messages."""

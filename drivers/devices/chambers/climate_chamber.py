@@ -13,6 +13,7 @@ from typing import Protocol, cast
 from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
 from drivers.devices.chambers.chamber_settings import ChamberUnitSettings
 from drivers.devices.exclusive import Exclusive
+from drivers.devices.in_force import InForce
 from drivers.settings import Identity, same_device
 from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
@@ -31,9 +32,9 @@ class ClimateChamber:
     """The calls of a regulator: channels pv, sp (degC), running, fault (1 or 0), and no outputs.
 
     allowed_degC: the set-points that the stand may ask for; a chamber whose own controller allows more is refused.
-    Identity, limits and humidity are looked at before the first command and after every loss. A set-point is sent only
-    when it differs from what the unit has. What somebody changed at the panel is reported, and never overwritten
-    unasked.
+    Identity, limits and humidity are looked at before the first command and after every loss, and at each look whether
+    the set-point is in force. A set-point is sent only when it differs from what the unit has. What somebody changed at
+    the panel is reported, and never overwritten unasked.
     """
 
     def __init__(
@@ -78,9 +79,15 @@ class ClimateChamber:
                 self._renew_ns = self._clock.now_ns() + seconds_ns(_RENEW_S)
             return self._readings(state)
 
+    async def in_force(self) -> InForce:
+        """As `Controller`."""
+        async with self._exclusive:
+            state = await self._call(self._ready)
+            return InForce(self._language.in_force_by, self._language.not_told, state.objections)
+
     async def set_temperature(self, degC: float) -> None:
         """Send a set-point, unless the unit has it, and read it back. Refused: outside what is allowed (nothing is
-        sent), clamped, or without effect."""
+        sent), clamped, or without effect. DeviceFault: it would not be in force; nothing is sent."""
         low_degC, high_degC = self._allowed_degC
         if not low_degC <= degC <= high_degC:
             raise Refused(self.name, f"{degC:g} degC is outside {low_degC:g}..{high_degC:g} degC; nothing was sent")
@@ -89,7 +96,8 @@ class ClimateChamber:
             self._sp_degC = degC
 
     async def run(self) -> None:
-        """Switch humidity off, start, confirmed. DeviceFault: an alarm stands, which only an operator may reset."""
+        """Switch humidity off, start, confirmed. DeviceFault: an alarm stands, which only an operator may reset, or
+        its set-point is not in force."""
         async with self._exclusive:
             await self._call(self._start)
             self._is_run, self._renew_ns = True, self._clock.now_ns() + seconds_ns(_RENEW_S)
@@ -146,7 +154,7 @@ class ClimateChamber:
 
     def _set(self, degC: float) -> None:
         state = self._ready()
-        self._refuse_by_hand(state)
+        self._refuse_out_of_force(state)
         near_K = self._language.resolution_K / 2
         if abs(state.set_degC - degC) < near_K and (state.ramp_degC is None or self._sp_degC == degC):
             return  # one that moves may only pass there
@@ -155,7 +163,7 @@ class ClimateChamber:
         for _ in range(_LOOKS):
             state = self._language.state()
             if abs(state.set_degC - degC) < near_K or self._on_its_way(state, degC):
-                return
+                return self._refuse_out_of_force(state)
         if abs(state.set_degC - self._from_degC) < near_K:
             text = f"not in control: the set-point {degC:g} degC had no effect"
             raise Refused(self.name, f"{text}; is remote control (EXTERN) on at the panel?")
@@ -168,17 +176,15 @@ class ClimateChamber:
         low_degC, high_degC = sorted((self._from_degC, degC))
         return low_degC <= state.ramp_degC <= high_degC
 
-    def _refuse_by_hand(self, state: ChamberState) -> None:
-        if state.by_hand:
-            raise Refused(self.name, f"not in control: {state.by_hand}; nothing was sent")
+    def _refuse_out_of_force(self, state: ChamberState) -> None:
+        if state.objections:
+            raise DeviceFault(self.name, f"its set-point is not in force: {'; '.join(state.objections)}")
 
     def _start(self) -> None:
         state = self._ready()
-        self._refuse_by_hand(state)
         if state.alarms:
             raise DeviceFault(self.name, f"{', '.join(state.alarms)}; look at the chamber, and reset it there")
-        if state.program:
-            raise DeviceFault(self.name, "a program of its own runs; end it at the panel")
+        self._refuse_out_of_force(state)
         if state.humidity_on:
             self._language.humidity_off()
             if self._language.state().humidity_on:
@@ -207,15 +213,12 @@ class ClimateChamber:
 
     def _readings(self, state: ChamberState) -> tuple[Reading, ...]:
         now_ns = self._clock.now_ns()
-        faults, sp_degC = list(state.alarms), state.set_degC
-        faults += [state.by_hand] if state.by_hand and self._is_run else []
+        faults, sp_degC = [*state.alarms, *state.objections], state.set_degC
         if self._sp_degC is not None:
             if self._on_its_way(state, self._sp_degC):
                 sp_degC = self._sp_degC
             elif abs(sp_degC - self._sp_degC) >= self._language.resolution_K / 2:
                 faults.append(f"set point changed at the unit, from {self._sp_degC:g} to {sp_degC:g} degC")
-        if state.program:
-            faults.append("a program of its own runs")
         doubt = "the door is open" if state.door_open else ""
         faults += [doubt] if doubt and self._is_run else []
         if state.humidity_on and self._is_run:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from drivers.devices.exclusive import Exclusive
+from drivers.devices.in_force import InForce
 from drivers.settings import Identity
 from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit, Sample, Snapshot, is_confirmed
+from drivers.wires.modbus_unit import CONFIRM_LOOKS, ModbusUnit, Sample, Snapshot, is_confirmed, objection
 from drivers.wires.registers import RegisterMap
 from foundation.clock import Clock, seconds_ns
-from foundation.errors import ConfigError, Occupied, Refused
+from foundation.errors import ConfigError, DeviceFault, Occupied, Refused
 from foundation.readings import Reading, bad_reading
 
 PROBE_PERIOD_S = 30.0
@@ -24,6 +25,9 @@ class Regulator:
     write mode, so that set points do not wear the EEPROM). When that is lost, or the unit was unreachable and may have
     been power-cycled, the start-up sequence runs again and the set point is sent again; it never runs or stops
     control by itself. `start_ups` counts completed sequences.
+
+    The set-point is in force while none of the map's `in_force` objects: asked before one is sent and before it runs,
+    once more when it does, and at each poll.
     """
 
     def __init__(self, name: str, bus: Bus, register_map: RegisterMap, clock: Clock) -> None:
@@ -36,6 +40,10 @@ class Regulator:
                 raise ConfigError(
                     f"{name}: {point}, which confirms {command}, needs poll: fast in {register_map.model}"
                 )
+        for check in register_map.in_force:
+            for point in (check.point, check.follows):
+                if point and point not in register_map.polled():
+                    raise ConfigError(f"{name}: {point} of in_force needs poll: fast in {register_map.model}")
         self.name = name
         self.start_ups = 0
         self._unit = ModbusUnit(name, bus, register_map)
@@ -80,11 +88,19 @@ class Regulator:
                 await self._unit.write("sp", self._sp_degC)
             return readings
 
+    async def in_force(self) -> InForce:
+        """As `Controller`."""
+        async with self._exclusive:
+            await self._ensure_started()
+            known_by = "; ".join(map(str, self._map.in_force))
+            not_told = self._map.not_told or ("" if known_by else "its register map has no in_force")
+            return InForce(known_by, not_told, self._objections(await self._unit.snapshot(self._map.polled())))
+
     async def set_temperature(self, degC: float) -> None:
         """Send a set point and read it back.
 
         Refused: outside the map's limits (nothing is sent), RAM mode not confirmed, not taken over. Occupied:
-        autotuning, started at the unit, is active.
+        autotuning, started at the unit, is active. DeviceFault: it would not be in force (nothing is sent), or is not.
         """
         async with self._exclusive:
             await self._ensure_started()
@@ -93,13 +109,44 @@ class Regulator:
                 await self._start_up()
             if status.bits.get(AUTOTUNE):
                 raise Occupied(self.name, "autotuning is active; no set point was sent")
+            await self._check_in_force(is_sent=False)
             self._sp_degC = await self._write_set_point(degC)
+            await self._check_in_force(is_sent=True)
 
     async def run(self) -> None:
-        """Start control, confirmed."""
+        """Start control, confirmed. DeviceFault when the set-point is not in force: then it is stopped again."""
         async with self._exclusive:
             await self._ensure_started()
+            await self._check_in_force(is_sent=False)
             await self._unit.command("run")
+            try:
+                await self._check_in_force(is_sent=True)
+            except DeviceFault:
+                await self._commands(self._map.safe_state)
+                raise
+
+    async def _check_in_force(self, *, is_sent: bool) -> None:
+        """is_sent: the set-point just now, so what follows it is asked, too, and may be a scan of the unit behind."""
+        if not self._map.in_force:
+            return
+        objections: tuple[str, ...] = ()
+        for _ in range(CONFIRM_LOOKS if is_sent else 1):
+            objections = self._objections(await self._unit.snapshot(self._map.polled()), are_followed=is_sent)
+            if not objections:
+                return
+        raise DeviceFault(self.name, f"its set-point is not in force: {'; '.join(objections)}")
+
+    def _objections(self, snapshot: Snapshot, *, are_followed: bool = True) -> tuple[str, ...]:
+        """Of a poll. What is refreshed falls back before the first set-point, and is followed from that on."""
+        running = is_confirmed(self._map.commands["run"], snapshot)
+        asked = [check for check in self._map.in_force if running or not check.while_running]
+        return tuple(
+            text
+            for check in asked
+            if not check.follows
+            or (are_followed and not (self._map.points[check.follows].refresh and self._sp_degC is None))
+            if (text := objection(check, snapshot))
+        )
 
     async def stop(self) -> None:
         """Stop control, confirmed; the outputs go to the unit's "MV at stop"."""
@@ -156,6 +203,7 @@ class Regulator:
         sp_degC = snapshot.samples["sp"].value
         if self._sp_degC is not None and sp_degC != self._sp_degC:
             faults.append("set point changed at the unit")
+        faults += self._objections(snapshot)
         running = is_confirmed(self._map.commands["run"], snapshot)
         quantities = [name for name in QUANTITIES if name in snapshot.samples]
         return (

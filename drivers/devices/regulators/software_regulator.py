@@ -15,6 +15,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from drivers.devices.in_force import InForce
 from drivers.devices.protocols import HeatOutput
 from drivers.devices.regulators import pid, relay_tuning
 from drivers.devices.regulators.heat_pulses import PulsesSettings
@@ -116,6 +117,10 @@ class SoftwareRegulator:
             Reading(f"{self.name}.running", float(running), "1", now_ns),
             Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason="; ".join(faults)),
         )
+
+    async def in_force(self) -> InForce:
+        """Nothing stands between the set-point and the law; what heats by it is read back by its own device."""
+        return InForce("this program itself controls by it, and reads back the output that it gives")
 
     async def set_temperature(self, degC: float) -> None:
         """Take a set-point. Refused outside what is allowed, Occupied while it tunes itself."""

@@ -29,8 +29,8 @@ class Chamber(Timeline, Protocol):
 class FakeClimateChamber:
     """What they share. limits_degC: of the controller. Faults: silent; ignores_writes (local, or an old firmware);
     clamps (a set-point outside the limits is taken as far as they go, and acknowledged); alarm (its code; "" none);
-    humidity_on; door_open; protected (the panel refuses remote control); stuck_degC. `press_setpoint`, `press_stop`:
-    at the panel. is_alone: no relay in series enables its heat.
+    humidity_on; door_open; protected (the panel refuses remote control); stuck_degC; program_degC (a program of its own
+    runs, and goes there). `press_setpoint`, `press_stop`: at the panel. is_alone: no relay in series enables its heat.
     """
 
     def __init__(self, plant: Chamber, clock: Now) -> None:
@@ -44,6 +44,7 @@ class FakeClimateChamber:
         self.humidity_on = self.door_open = False
         self.protected = False
         self.stuck_degC: float | None = None
+        self.program_degC: float | None = None
         self.setpoint_writes = 0
         self.is_alone = True
         self._plant = plant
@@ -69,6 +70,11 @@ class FakeClimateChamber:
         self.setpoint_degC = self.setpoint_degC if running_at_degC is None else running_at_degC
 
     @property
+    def acting_degC(self) -> float:
+        """Where it goes, whatever set-point was written."""
+        return self.setpoint_degC if self.program_degC is None else self.program_degC
+
+    @property
     def actual_degC(self) -> float:
         """What it shows."""
         return self._plant.chamber_degC if self.stuck_degC is None else self.stuck_degC
@@ -91,16 +97,15 @@ class FakeClimateChamber:
         return True
 
     def switch(self, on: bool) -> None:
-        """Start or stop from the wire."""
+        """Start or stop from the wire; a stop ends a program, too."""
         if not self.ignores_writes:
             self.running = on
+            self.program_degC = self.program_degC if on else None
 
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         if self._stops_ns is not None and time_ns >= self._stops_ns:
             self.running, self._stops_ns = False, None
-        share = (
-            (self.setpoint_degC - self.actual_degC) / PROPORTIONAL_BAND_K if self.running and not self.alarm else 0.0
-        )
+        share = (self.acting_degC - self.actual_degC) / PROPORTIONAL_BAND_K if self.running and not self.alarm else 0.0
         if self.is_alone:
             self._plant.heater_enabled = True
         self._plant.heater_on_fraction = min(1.0, max(0.0, share))
@@ -146,8 +151,9 @@ class FakeEspec(FakeClimateChamber):
     def _answer(self, command: str) -> str:
         low_degC, high_degC = self.limits_degC
         alarms, mode = [self.alarm] if self.alarm else [], "CONSTANT" if self.running else "STANDBY"
+        mode = mode if self.program_degC is None else "RUN"
         queries = {
-            "TEMP?": f"{self.actual_degC:.1f},{self.setpoint_degC:.1f},{high_degC:.1f},{low_degC:.1f}",
+            "TEMP?": f"{self.actual_degC:.1f},{self.acting_degC:.1f},{high_degC:.1f},{low_degC:.1f}",
             "MON?": f"{self.actual_degC:.1f},50,{self.mode or mode},{len(alarms)}",
             "HUMI?": f"48,{'50' if self.humidity_on else 'OFF'},100,0",
             "MODE?": mode,
@@ -185,9 +191,9 @@ class FakeEspec(FakeClimateChamber):
 class FakeCts(FakeClimateChamber):
     """CTS unit `unit`. On a serial line STX, 80+unit, text, CHK, ETX with bit 7 set between STX and ETX and CHK the XOR
     of address and text; over TCP the bare text without an end. An unknown command is not answered. paused: at its
-    panel."""
+    panel. ramps: one of its own runs."""
 
-    paused = False
+    paused = ramps = False
 
     def __init__(self, plant: Chamber, clock: Now, unit: int = 1, *, is_serial: bool = False) -> None:
         super().__init__(plant, clock)
@@ -228,7 +234,11 @@ class FakeCts(FakeClimateChamber):
     def _answer(self, command: str) -> str:
         match command[:2]:
             case "A0":
-                return f"A0 {self.actual_degC:05.1f} {self.setpoint_degC:05.1f}"
+                return f"A0 {self.actual_degC:05.1f} {self.acting_degC:05.1f}"
+            case "P":
+                return f"P{0 if self.program_degC is None else 2:03d}"
+            case "R1":
+                return f"R1 1{int(self.ramps)} 001.0 001.0 {self.setpoint_degC:05.1f}"
             case "a0":
                 self.set(float(command[3:]))
                 return "a"
@@ -272,7 +282,7 @@ class FakeWeiss(FakeClimateChamber):
         return Conversation(self, take)
 
     def _nominal_degC(self) -> float:
-        return self.setpoint_degC if self.ramp_K_per_min is None else self._shown_degC
+        return self.acting_degC if self.ramp_K_per_min is None else self._shown_degC
 
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         super()._on_step(time_ns, dt_s)

@@ -79,7 +79,8 @@ class FakeRegulator:
     Faults: silent; compoway (the factory protocol is selected: no answer on Modbus); sensor_break; ad_error;
     stuck_pv_degC (the PV stays there); pv_offset_K (the probe reads wrong); pv_drift_K_per_h; probe_out (the probe was
     pulled out of the chamber); probe_exchanged (with the thermometer near the camera); display_decimals other than 1;
-    setpoint_clamp_degC (a set point is acknowledged but stored inside these limits).
+    setpoint_clamp_degC (a set point is acknowledged but stored inside these limits); acting_degC (another set-point
+    than 0x2103 acts: multi-SP or remote SP); ramp_K_per_min (its own SP ramp, from the PV on when it starts).
     eeprom_writes counts worn cells.
     """
 
@@ -97,6 +98,9 @@ class FakeRegulator:
         self.probe_exchanged = False
         self.display_decimals = 1
         self.setpoint_clamp_degC: tuple[float, float] | None = None
+        self.acting_degC: float | None = None
+        self.ramp_K_per_min: float | None = None
+        self._ramped_degC: float | None = None
         self._tuning_share = 1.0
         self._cycle: self_tuning.Cycle | None = None
         self._plant = plant
@@ -141,7 +145,7 @@ class FakeRegulator:
         return {
             0x2000: lambda: to_word(self._shown_degC(), self.display_decimals),
             0x2001: self._status_low,
-            0x2002: lambda: self._register(SETPOINT),
+            0x2002: lambda: to_word(self._target_degC(), self.display_decimals),
             0x2003: lambda: 0,
             0x2004: lambda: to_word(self.outputs.heat_pct, 1),
             0x2005: lambda: to_word(self.outputs.cool_pct, 1),
@@ -251,7 +255,7 @@ class FakeRegulator:
 
     def _automatic(self) -> None:
         if Mode.MANUAL in self._modes and Mode.STOP not in self._modes:
-            self._pid = resume(self.outputs, self._ram[SETPOINT], self._pv_degC(), self._gains)
+            self._pid = resume(self.outputs, self._target_degC(), self._pv_degC(), self._gains)
         self._modes.discard(Mode.MANUAL)
 
     def _save(self) -> None:
@@ -328,6 +332,7 @@ class FakeRegulator:
 
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         self._feel(dt_s)
+        self._ramp(dt_s)
         self.outputs = self._control(dt_s)
         heat_pct = self.outputs.heat_pct
         if heat_pct <= 0:
@@ -348,8 +353,8 @@ class FakeRegulator:
         pv_degC = self._pv_degC()
         if Mode.TUNING in self._modes:
             self._pid = None
-            return self._tuned(pv_degC - self._ram[SETPOINT])
-        outputs, self._pid = step(self._pid or start(pv_degC), self._ram[SETPOINT], pv_degC, dt_s, self._gains)
+            return self._tuned(pv_degC - self._target_degC())
+        outputs, self._pid = step(self._pid or start(pv_degC), self._target_degC(), pv_degC, dt_s, self._gains)
         return outputs
 
     def _tuned(self, error_K: float) -> Outputs:
@@ -366,6 +371,21 @@ class FakeRegulator:
                     self._store(address, value, keep=Mode.RAM not in self._modes)
             self._modes.discard(Mode.TUNING)
         return _signed(upper if cycle.heats else lower)
+
+    def _target_degC(self) -> float:
+        """Where it goes: the internal set point."""
+        wanted_degC = self._ram[SETPOINT] if self.acting_degC is None else self.acting_degC
+        if self.ramp_K_per_min is None or Mode.STOP in self._modes:
+            return wanted_degC
+        return self._pv_degC() if self._ramped_degC is None else self._ramped_degC
+
+    def _ramp(self, dt_s: float) -> None:
+        if self.ramp_K_per_min is None or Mode.STOP in self._modes:
+            self._ramped_degC = None
+            return
+        at_degC, step_K = self._ramped_degC, self.ramp_K_per_min * dt_s / 60
+        at_degC = self._pv_degC() if at_degC is None else at_degC
+        self._ramped_degC = at_degC + max(-step_K, min(step_K, self._ram[SETPOINT] - at_degC))
 
     def _pv_degC(self) -> float:
         if self.stuck_pv_degC is not None:

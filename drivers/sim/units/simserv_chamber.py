@@ -12,12 +12,13 @@ _ACCEPTED, _NO_COMMAND, _BAD_PARAMETER, _NO_CHANNEL = "1", "-5", "-6", "-8"
 
 class FakeSimserv(FakeClimateChamber):
     """Control variable 1; digital channel 1 starts, 2 is humidity. An unknown number is answered by -5, a set-point
-    outside of the limits by -6. in_program: a program of its own runs."""
+    outside of the limits by -6. gradient_K_per_min: upwards, 0 for none; None for a unit that does not know them.
+    A program goes on when the start channel is cleared, until it is ended (19015)."""
 
     def __init__(self, plant: Chamber, clock: Now, chamber: int = 1) -> None:
         super().__init__(plant, clock)
         self._chamber = str(chamber)
-        self.in_program = False
+        self.gradient_K_per_min: float | None = 0.0
         self.serial_number = "58226123450010"
 
     def engine(self) -> Conversation:
@@ -36,7 +37,7 @@ class FakeSimserv(FakeClimateChamber):
         if chamber != self._chamber:
             return b"-4"
         reads = {
-            ("10010", ()): "4" if self.in_program else "2",
+            ("10010", ()): "2" if self.program_degC is None else "4",
             ("10012", ()): str(1 + 2 * self.running + 8 * bool(self.alarm)),
             ("11002", ("1",)): f"{self.setpoint_degC:.1f}",
             ("11004", ("1",)): f"{self.actual_degC:.2f}",
@@ -47,10 +48,16 @@ class FakeSimserv(FakeClimateChamber):
             ("99997", ("1",)): "VT3 7034",
             ("99997", ("2",)): "2014",
             ("99997", ("3",)): self.serial_number,
+            **self._gradients(),
             **self._messages(),
         }
         value = reads.get((command, tuple(arguments)))
         return b"1\xb6" + value.encode("latin-1") if value is not None else self._order(command, arguments).encode()
+
+    def _gradients(self) -> dict[tuple[str, tuple[str, ...]], str]:
+        if self.gradient_K_per_min is None:
+            return {}
+        return {("11066", ("1",)): f"{self.gradient_K_per_min:.1f}", ("11070", ("1",)): "0.0"}
 
     def _messages(self) -> dict[tuple[str, tuple[str, ...]], str]:
         """Two: an information that always stands, and the alarm."""
@@ -68,8 +75,13 @@ class FakeSimserv(FakeClimateChamber):
                     return _NO_CHANNEL
                 taken = re.fullmatch(r"-?\d+(\.\d+)?", value) and self.set(float(value))
                 return _ACCEPTED if taken else _BAD_PARAMETER
-            case "14001", ["1", "0" | "1"]:
+            case "19015", []:
+                self.program_degC = None
+                return _ACCEPTED
+            case "14001", ["1", "0" | "1"] if self.program_degC is None:
                 self.switch(arguments[1] == "1")
+                return _ACCEPTED
+            case "14001", ["1", "0" | "1"]:
                 return _ACCEPTED
             case "14001", ["2", "0" | "1"]:
                 self.humidity_on = arguments[1] == "1"

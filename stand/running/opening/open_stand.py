@@ -12,7 +12,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Protocol, TypeVar
 
 from foundation.clock import VirtualClock, WallClock
-from foundation.errors import StandError, Unreachable
+from foundation.errors import DeviceFault, StandError, Unreachable
 from foundation.patience import Patience
 from foundation.tasks import cancelled, watched
 from recording.writing.disk import FILES_LINE, Disk
@@ -277,12 +277,13 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
         stack.callback(assembly.stand.gate.let_go)
         stack.push_async_callback(stop.settled)
         stop.watch(assembly.stand)
-        await open_stand.or_safe(_open(assembly), stop)
+        await open_stand.or_safe(_open(assembly, is_for_one=is_for_one), stop)
         yield open_stand
 
 
-async def _open(assembly: Assembly) -> None:
-    """Connect everything; nothing may heat, cool or move before that."""
+async def _open(assembly: Assembly, *, is_for_one: bool) -> None:
+    """Connect everything; nothing may heat, cool or move before that. DeviceFault when the one run it is for could not
+    control: its set-point would not be in force."""
     devices, stand = assembly.devices, assembly.stand
     try:
         await assembly.bus.open()
@@ -297,6 +298,8 @@ async def _open(assembly: Assembly) -> None:
     await devices.regulator.open()
     stand.opened(devices.regulator)
     await devices.regulator.stop()
+    if is_for_one and (objections := (await devices.regulator.in_force()).objections):
+        raise DeviceFault(devices.regulator.name, f"its set-point is not in force: {'; '.join(objections)}")
     await devices.thermometers.open()
     for probe in devices.probes.values():
         await probe.open()
