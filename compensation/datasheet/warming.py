@@ -20,7 +20,9 @@ _GROUP = "Switching on"
 _NAMES = ("Drift in the warm-up, I", "Drift in the warm-up, J", "Change of scale in the warm-up")
 _SETTLED = 0.9
 _LAST_S = 300.0
+_MOST_EXPONENTIALS = 10
 _NO_WARM_UP = "no warm-up was recorded at the reference's place"
+_OF_RESIDUALS = "residuals of a line and exponentials"
 _NO_CURVE = "no temperature coefficient to compare with"
 
 
@@ -53,16 +55,32 @@ def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -
         model += " after switching on" if warming.known else " of the recording"
         lines = (
             direct("what does not repeat", "A", math.sqrt(2) * scatter[motion], unit, UNREPEATED),
-            direct("noise of the markers", "A", _noise(warming.moved[:, motion]), unit, "differences of frames"),
+            direct("noise of the frames", "A", math.sqrt(2) * frame_noise(warming.since_s, warming.moved[:, motion]),
+                   unit, _OF_RESIDUALS),
             Contribution("temperature it began at", "B", u_air_K, "K", value / risen_K, "thermometer and its place"),
-        )
+        )  # fmt: skip
         found.append(Quantity(key, _GROUP, name, unit, value, model, lines))
     return found
 
 
-def _noise(values: Float) -> float:
-    """Of the difference of two frames, from second differences, which a smooth drift has none of."""
-    return float(np.sqrt(2 * np.mean(np.diff(values, 2) ** 2) / 6))
+def frame_noise(since_s: Float, values: Float) -> float:
+    """Standard deviation of one frame about the drift: of the residuals of a line and exponentials, by least squares.
+
+    since_s, values (F,), F >= 5. A warm-up is a sum of exponentials, so that no drift is left in the residuals,
+    whatever the interval between frames; second differences take its curvature for noise. Of noiseless drifts of 0.3 px
+    with one or two time constants of 90 to 1900 s, 5 to 240 s between frames, this leaves at most 0.0002 px; of less
+    than ten frames up to 0.01 px, for then there are too few for two exponentials.
+    """
+    at_s = since_s - since_s[0]
+    count, span_s = len(at_s), float(at_s[-1])
+    # Time constants from half an interval to the whole warm-up; half of the frames are left for the residuals.
+    shortest_s = span_s / (count - 1) / 2
+    constants_s = np.geomspace(shortest_s, span_s, min(_MOST_EXPONENTIALS, max(1, (count - 4) // 2)))
+    terms = np.column_stack([np.ones(count), at_s / span_s, np.exp(-at_s[:, None] / constants_s)])
+    terms /= np.linalg.norm(terms, axis=0)
+    found, _, rank, _ = np.linalg.lstsq(terms, values, rcond=1e-12)
+    left = values - terms @ found
+    return math.sqrt(float(left @ left) / (count - int(rank)))
 
 
 def _settling(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
@@ -73,7 +91,7 @@ def _settling(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
     size = float(np.linalg.norm(whole))
     along = warming.moved[:, :2] @ whole / max(size, 1e-12)
     model = f"first time after which the drift along its direction stays above {_SETTLED:.0%} of its last value"
-    noise = _noise(along)
+    noise = math.sqrt(2) * frame_noise(warming.since_s, along)
     if size < 10 * noise:
         return Quantity(
             key, _GROUP, name, "s", math.nan, model, (), "the warm-up moves the image by no more than noise"
@@ -84,7 +102,7 @@ def _settling(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
     value = float(warming.since_s[below] + step_s * (_SETTLED * size - along[below]) / max(float(step_px), 1e-12))
     rate = max(_slope(warming.since_s, along, value), 1e-9)
     lines = (
-        Contribution("drift at that time", "A", noise, "px", 1 / rate, "differences of frames"),
+        Contribution("drift at that time", "A", noise, "px", 1 / rate, _OF_RESIDUALS),
         Contribution("what does not repeat", "A", float(np.hypot(scatter[0], scatter[1])), "px", 1 / rate,
                      UNREPEATED),
         direct("instant of switching on", "B", 0.5, "s", "a second between commands and readings"),

@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 from compensation.cli import app
 from compensation.datasheet.datasheet import Datasheet, datasheet
 from compensation.datasheet.details import Details, load_details
-from compensation.datasheet.motions import motions
+from compensation.datasheet.motions import Visits, Warming, motions
 from compensation.datasheet.quantity import NIGHTS, Contribution, Quantity, direct, pooled
+from compensation.datasheet.warming import frame_noise, warming_quantities
 from compensation.drift.choosing import fit
 from compensation.drift.paper_fit import fit_paper
 from compensation.observations import Observations
@@ -258,3 +259,24 @@ def test_the_noise_of_the_markers_is_small_beside_the_rest(sheet: Datasheet):
 )
 def test_a_number_of_a_budget_has_its_digits_and_no_exponent(value: float, digits: int, text: str):
     assert significant(value, digits) == text
+
+
+@pytest.mark.parametrize("spacing_s", [5.0, 30.0, 120.0, 240.0])
+@pytest.mark.parametrize("noise_px", [0.0, 0.005, 0.02, 0.05])
+def test_the_noise_of_a_warm_up_is_that_of_its_frames_and_not_its_curvature(spacing_s: float, noise_px: float):
+    rng, at_s = np.random.default_rng(5), np.arange(0.0, 7200.0, spacing_s)
+    for constants_s in ((370.0,), (370.0, 1900.0), (90.0, 1200.0)):
+        drift = sum(0.3 * -np.expm1(-at_s / constant_s) for constant_s in constants_s)
+        found = [frame_noise(at_s, drift + noise_px * rng.standard_normal(len(at_s))) for _ in range(40)]
+        assert math.sqrt(np.mean(np.square(found))) == pytest.approx(noise_px, rel=0.1, abs=5e-4)
+
+
+def test_the_uncertainty_of_a_warm_up_s_drift_is_no_part_of_the_drift():
+    at_s = np.arange(60.0, 4000.0, 120.0)
+    moved = np.outer(-np.expm1(-at_s / 370.0), [0.1, 0.3, 20.0, 1.0])
+    warming = Warming(at_s, True, np.full(len(at_s), 24.0), 24 + 8 * -np.expm1(-at_s / 370.0), moved - moved[0])
+    nothing = np.empty(0)
+    visits = Visits(nothing, nothing, nothing, np.empty((0, 4)))
+    known = {each.key: each for each in warming_quantities(warming, visits, (0.001, 0.001, 1.0, 1.0), 0.1)}
+    noise = {key: known[key].contributions[1].amount for key in ("warm_up_shift_I", "warm_up_shift_J")}
+    assert max(noise.values()) < 0.0005
