@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.history.thermal_history import History, refined
+from compensation.history.known_states import Column, history_of
+from compensation.history.thermal_history import History
 from compensation.observations import Float, Observations, SessionFacts
 from experiments.steps import Role
 from foundation.clock import NS_PER_S
@@ -25,7 +26,9 @@ def observations_of(
     chamber_degC: ArrayLike | None = None,
     reference_degC: float | None = None,
     role: ArrayLike | None = None,
-    air: tuple[ArrayLike, ArrayLike] | None = None,
+    air: Column | None = None,
+    supply: Column | None = None,
+    camera: Column | None = None,
     sigma_px: float = 0.01,
     covariance_px2: ArrayLike | None = None,
     image_size: tuple[int, int] | None = None,
@@ -39,16 +42,20 @@ def observations_of(
     not used. time_ns (F,): middle of the exposure, ascending; else a frame a second. chamber_degC (F,): the set-point,
     whose frames are left out together to choose a model; else camera_degC in whole degrees. role (F,): of
     experiments.steps.Role; else `reference` at the set-point nearest to reference_degC (else that of the first frame)
-    and `fit` at the others. air: (time_ns, degC), both (A,), near the camera, for the thermal form. sigma_px: standard
+    and `fit` at the others. air: (time_ns, degC), both (A,), near the camera, for the thermal form; with it
+    supply: (time_ns, 0 or 1), when the camera was off and on, else it was on all the time; camera: (time_ns, degC), its
+    own readings between the frames, else it is taken to go straight from one to the next. sigma_px: standard
     uncertainty of a coordinate, where there is no covariance_px2 (F, N, 2, 2). image_size: (width, height), else what
     holds the centres. ValueError when shapes do not agree, or something cannot be what it is given as.
     """
-    centres, camera = _seen(centres_px, camera_degC)
+    centres, own = _seen(centres_px, camera_degC)
+    if air is None and (supply is not None or camera is not None):
+        raise ValueError("supply and camera say more of a camera's past only together with air")
     frames, count = centres.shape[:2]
-    instants, chamber, roles = _columns(camera, time_ns, chamber_degC, role, reference_degC)
-    missing, size = np.isnan(centres).any(axis=2) | np.isnan(camera)[:, None], image_size or _size_of(centres)
+    instants, chamber, roles = _columns(own, time_ns, chamber_degC, role, reference_degC)
+    missing, size = np.isnan(centres).any(axis=2) | np.isnan(own)[:, None], image_size or _size_of(centres)
     covariance = _covariance(covariance_px2, sigma_px, missing)
-    history = None if air is None else _history(air, instants, camera)
+    history = None if air is None else history_of(air, supply, camera, instants, own)
     return Observations(
         target=target or _unnamed(count),
         sessions=(SessionFacts(name, "", camera_serial, "", "", simulated=None, incomplete=0),),
@@ -60,12 +67,12 @@ def observations_of(
         role=roles,
         step_id=("",) * frames,
         chamber_degC=chamber,
-        camera_degC=camera,
+        camera_degC=own,
         air_degC=_air_at(history, instants),
         centres_px=np.where(missing[..., None], np.nan, centres),
         covariance_px2=np.where(missing[..., None, None], np.nan, covariance),
         flags=np.zeros((frames, count), np.uint8),
-        reasons=tuple(map(_reason, camera.tolist(), np.all(missing, axis=1).tolist())),
+        reasons=tuple(map(_reason, own.tolist(), np.all(missing, axis=1).tolist())),
         histories=() if history is None else (history,),
     )
 
@@ -156,20 +163,6 @@ def _roles(chamber_degC: Float, reference_degC: float | None) -> NDArray[np.str_
     wanted = chamber_degC[0] if reference_degC is None else reference_degC
     nearest = known[np.argmin(np.abs(known - wanted))] if len(known) else math.nan
     return np.where(chamber_degC == nearest, str(Role.REFERENCE), str(Role.FIT))
-
-
-def _history(air: tuple[ArrayLike, ArrayLike], instants: NDArray[np.int64], camera_degC: Float) -> History:
-    """What lags are computed from; the camera's supply is on, for it has temperatures."""
-    if len(air) != 2:
-        raise ValueError(f"air: expected (time_ns, degC), not {len(air)} columns")
-    time_ns, degC = np.array(air[0], np.int64), _numbers("air", air[1])
-    if time_ns.ndim != 1 or time_ns.shape != degC.shape:
-        raise ValueError(
-            f"air: expected (time_ns, degC), two columns of the same length, not {time_ns.shape} and {degC.shape}"
-        )
-    good, measured = np.isfinite(degC), np.isfinite(camera_degC)
-    nothing = np.empty(0, np.int64), np.empty(0)
-    return refined(History(time_ns[good], degC[good], *nothing, instants[measured], camera_degC[measured]))
 
 
 def _unnamed(count: int) -> Target:

@@ -72,6 +72,7 @@ class Detection:
     excess_px2: (2,), what misfit of ground and disc adds to them, px^2. band_sigma: half width of the band of pixels
     fitted, in blurs (band.py). The next frame keeps these two. is_doubtful: the noise model does not describe the
     picture (compression, texture, print, flicker): the covariance is an estimate from how its residuals hang together.
+    is_orientation_assumed: nothing says which way up the target is (Target.orientation): half a turn looks the same.
     """
 
     centres_px: Float
@@ -84,6 +85,7 @@ class Detection:
     excess_px2: Float
     band_sigma: float
     is_doubtful: bool
+    is_orientation_assumed: bool = False
 
     @property
     def found(self) -> int:
@@ -114,7 +116,9 @@ def detect(
         followed = _follow(grey, target, previous, noise)
         if followed is not None:
             return followed
-    return _search(grey_image(image), grey, target, None if previous is None else previous.homography, noise, watch)
+    homography = None if previous is None else previous.homography
+    found = _search(grey_image(image), grey, target, homography, noise, watch)
+    return replace(found, is_orientation_assumed=target.is_orientation_assumed)
 
 
 def rows_to_follow(previous: Detection, target: Target, height: int) -> Mask:
@@ -142,7 +146,8 @@ def _follow(picture: Picture, target: Target, previous: Detection, noise: Noise 
     with suppress(DetectionError):
         tracked = _fit_in_band(picture, target, previous.state, noise, previous.band_sigma, sampled)
         if tracked is not None and has_followed(tracked[0].centres_px, previous.centres_px):
-            return _doubted(tracked[0], previous.excess_px2)
+            found = _doubted(tracked[0], previous.excess_px2)
+            return replace(found, is_orientation_assumed=target.is_orientation_assumed)
     return None
 
 

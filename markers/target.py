@@ -148,14 +148,19 @@ class Target(Document):
         return self.minimum_markers if self.minimum_markers is not None else math.ceil(0.75 * self.count)
 
     @property
+    def is_orientation_assumed(self) -> bool:
+        """Whether neither a mark on the target nor its file says which way up it is."""
+        is_marked = self.odd_marker is not None or self.donut_markers is not None
+        return not is_marked and "nominal_roll_deg" not in self.model_fields_set
+
+    @property
     def orientation(self) -> str:
         """How it is known which way up the target is, in a sentence."""
         if self.odd_marker is not None:
             return f"orientation: by the odd marker {self.odd_marker.number}"
         if self.donut_markers is not None:
             return "orientation: by the donut markers {}, {} and {}".format(*self.donut_markers.numbers)
-        known = "nominal_roll_deg" in self.model_fields_set
-        said = "as the target file says" if known else "assumed, for the target file does not say"
+        said = "assumed, for the target file does not say" if self.is_orientation_assumed else "as the target file says"
         return (
             f"orientation: {self.name} looks the same after half a turn; its rows are taken to point within 75 deg of "
             f"{self.nominal_roll_deg:g} deg in the image ({said}: nominal_roll_deg)"

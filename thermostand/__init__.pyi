@@ -1,11 +1,18 @@
+from compensation import Board as Board
 from compensation import Calibration as Calibration
 from compensation import DriftModel as DriftModel
 from compensation import Evaluation as Evaluation
 from compensation import Observations as Observations
+from compensation import Outside as Outside
 from compensation import Positions as Positions
 from compensation import Role as Role
+from compensation import States as States
 from compensation import TableSigma as TableSigma
+from compensation import ViewCalibration as ViewCalibration
+from compensation import Views as Views
+from compensation import anchored as anchored
 from compensation import calibrate as calibrate
+from compensation import calibrate_views as calibrate_views
 from compensation import evaluate as evaluate
 from compensation import finder as finder
 from compensation import fit as fit
@@ -14,6 +21,7 @@ from compensation import observations_of as observations_of
 from compensation import observe as observe
 from compensation import observe_positions as observe_positions
 from compensation import save_model as save_model
+from compensation import states as states
 from compensation import write_report as write_report
 from foundation.errors import ConfigError as ConfigError
 from foundation.errors import StandError as StandError

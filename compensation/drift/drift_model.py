@@ -20,7 +20,7 @@ Flags = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Situation = States | Float | float
 """Thermal states, one for each point or one for all; or only the camera's temperature, degC, which is enough for the
-paper's form and leaves the thermal one without an answer (NaN)."""
+paper's form only (states_of)."""
 
 
 class Outside(IntFlag):
@@ -69,9 +69,16 @@ class DriftModel(ABC):
         it extrapolates: ask `flags`. NaN in, and an unknown state, NaN out."""
 
     def correct(self, xy_px: Float, state: Situation) -> Float:
-        """Where the points (N, 2), px, would be at the reference."""
+        """Where the points (N, 2), px, would be at the reference; NaN where a point, or one of several states, is NaN.
+
+        ValueError when not a single point has an answer, as in states that are not known.
+        """
         points = points_of(xy_px)
-        return points + self.shift(points, state)
+        corrected = points + self.shift(points, state)
+        known = np.isfinite(points).all(axis=1)
+        if known.any() and not np.isfinite(corrected[known]).any():
+            raise ValueError(f"a model of the form {self.form} cannot correct these points: the camera's state is NaN")
+        return corrected
 
     @abstractmethod
     def covariance(self, xy_px: Float, state: Situation) -> Float:
@@ -92,10 +99,21 @@ class DriftModel(ABC):
 
 
 def states_of(state: Situation, count: int, memory: Memory) -> States:
-    """One state for each of `count` points."""
+    """One state for each of `count` points. ValueError when there are more or fewer, or a temperature alone is given to
+    a form that remembers."""
     if not isinstance(state, States):
-        return States.at_degC(state, count, memory)
-    return state if len(state.camera_degC) == count else state.where(np.zeros(count, np.int64))
+        if memory.taus_s or memory.plays:
+            raise ValueError(
+                "a model of the form thermal follows the camera's past, and its temperature alone does not say it: "
+                "give thermostand.states(model, session), or of arrays; model.other is the paper's form, if it has one"
+            )
+        degC = np.asarray(state, np.float64)
+        if degC.shape not in ((), (1,), (count,)):
+            raise ValueError(f"one temperature for all {count} points, or one for each, not {degC.shape}")
+        return States.at_degC(degC, count, memory)
+    if (found := len(state.camera_degC)) not in (1, count):
+        raise ValueError(f"one state for all {count} points, or one for each, not {found}")
+    return state if found == count else state.where(np.zeros(count, np.int64))
 
 
 def points_of(xy_px: Float) -> Float:

@@ -45,6 +45,19 @@ class FramesTable:
     def __len__(self) -> int:
         return len(self.time_ns)
 
+    def __repr__(self) -> str:
+        """Ten lines: the columns with their types, and how many frames of which roles."""
+        roles, counts = np.unique(self.role, return_counts=True)
+        of_roles = ", ".join(f"{count} {role or 'without a role'}" for role, count in zip(roles, counts, strict=True))
+        lines = [f"FramesTable of {len(self)} frames" + (f": {of_roles}" if len(self) else "")]
+        columns = list(self.columns().items())
+        width = max(len(name) for name, _ in columns)
+        for name, column in columns[:8]:
+            shown = ", ".join(map(str, column[:3])) + (", ..." if len(column) > 3 else "")
+            lines.append(f"  {name:<{width}}  {shown}")
+        lines.append("  " + ", ".join(name for name, _ in columns[8:]) + "; columns() for pandas.DataFrame")
+        return "\n".join(lines)
+
     def columns(self) -> dict[str, NDArray[np.generic]]:
         """Name -> column, the axes as `linear_position`: what pandas.DataFrame and the like take."""
         names = (

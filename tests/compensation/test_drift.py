@@ -16,6 +16,7 @@ from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_fit import choose, fit_paper
 from compensation.drift.paper_model import DegreeScore, PaperModel
 from compensation.drift.polynomial import condense, design, solve
+from compensation.history.states import States
 from compensation.observations import Observations, concatenate
 from experiments.steps import Role
 from foundation.errors import ConfigError, SessionError
@@ -145,8 +146,19 @@ def test_the_hull_has_the_corners_only():
 
 
 def test_nan_in_is_nan_out(model: PaperModel):
-    got = model.correct(np.array([[np.nan, 5.0], [1000.0, 1000.0]]), np.array([40.0, np.nan]))
-    assert np.isnan(got).all()
+    points = np.array([[np.nan, 5.0], [1000.0, 1000.0], [1000.0, 1000.0]])
+    got = model.correct(points, np.array([40.0, np.nan, 40.0]))
+    assert np.isnan(got[:2]).all()
+    assert np.isfinite(got[2]).all()
+
+
+def test_an_answer_that_is_not_known_is_an_error(model: PaperModel):
+    with pytest.raises(ValueError, match="the camera's state is NaN"):
+        model.correct(np.array([[1000.0, 1000.0]]), np.nan)
+    with pytest.raises(ValueError, match="one temperature for all 3 points"):
+        model.correct(np.full((3, 2), 1000.0), np.array([40.0, 41.0]))
+    with pytest.raises(ValueError, match="one state for all 3 points"):
+        model.correct(np.full((3, 2), 1000.0), States.at_degC(np.array([40.0, 41.0]), 2))
 
 
 def test_the_reference_is_the_mean_of_the_reference_frames(noisy: Observations, model: PaperModel):

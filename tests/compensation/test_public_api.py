@@ -10,6 +10,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,9 @@ import compensation
 import markers
 import recording
 import thermostand
+from compensation.drift.training import frame_states
+from compensation.history.states import Memory
+from compensation.history.thermal_history import History, states_at
 from experiments.steps import Role
 
 from .conftest import Recorded
@@ -30,7 +35,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", NOTEBOOK, re.DOTALL)
 
 @pytest.mark.usefixtures("undrawn")
 def test_what_the_notebook_page_shows_runs(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    assert len(BLOCKS) == 5
+    assert len(BLOCKS) == 6
     (tmp_path / "night").symlink_to(recorded.path)
     asyncio.run(record_calibration(tmp_path / "calibration", "calibration"))
     monkeypatch.chdir(tmp_path)
@@ -145,8 +150,8 @@ def test_air_over_time_makes_a_history_for_the_thermal_form():
         ({"covariance_px2": -np.eye(2)}, r"covariance_px2 of frame 0, marker 0 is no covariance"),
         ({"covariance_px2": np.full((12, 24, 2, 2), np.nan)}, r"covariance_px2 of frame 0, marker 0 is no covariance"),
         ({"sigma_px": 0.0}, r"sigma_px is 0.0; expected one above 0"),
-        ({"air": np.zeros(12)}, r"air: expected \(time_ns, degC\)"),
-        ({"air": (np.zeros(3), np.zeros(4))}, r"air: expected \(time_ns, degC\), two columns of the same length"),
+        ({"air": np.zeros(12)}, r"air: expected \(time_ns, values\)"),
+        ({"air": (np.zeros(3), np.zeros(4))}, r"air: expected \(time_ns, values\), two columns of the same length"),
     ],
 )
 def test_arrays_that_do_not_agree_are_refused(change: dict[str, object], sentence: str):
@@ -169,6 +174,38 @@ def test_lists_do_as_arrays_and_points_of_another_shape_are_refused():
     np.testing.assert_array_equal(model.correct(place, 50.0), model.correct(np.array(place), 50.0))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"points are \(N, 2\), not \(2,\)"):
         model.correct(np.array([300.0, 200.0]), 50.0)
+
+
+def test_every_name_that_the_notebook_page_uses_is_there():
+    names = set(re.findall(r"thermostand\.([A-Za-z_]+)", NOTEBOOK))
+    assert {"states", "anchored", "calibrate_views"} <= names
+    assert names <= set(dir(thermostand))
+
+
+def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings():
+    """Frames at the ends of a night; in between the camera was off for two hours, which frames alone do not tell."""
+    air_ns = np.arange(0, 8 * 3600, 60) * 10**9
+    hours = air_ns / 3.6e12
+    is_on = ((hours < 3) | (hours >= 5)).astype(float)
+    own_degC = np.where(is_on > 0, 24 + 15 * -np.expm1(-np.where(hours < 3, hours, hours - 5) / 0.4), np.nan)
+    frames = np.isin(air_ns, air_ns[[10, 60, 170, 312]])
+    known: dict[str, Any] = {"air": (air_ns, np.full(len(air_ns), 24.0))}
+    told = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
+    memory = Memory((1620.0,), (), 15.0)
+    history = History(*known["air"], air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
+    truth = states_at(history, memory, air_ns[frames], own_degC[frames])
+    model: Any = SimpleNamespace(memory=memory)
+    found = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **told)
+    np.testing.assert_allclose(found.power_lag, truth.power_lag)
+    blind = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **known)
+    assert np.abs(blind.power_lag - truth.power_lag).max() > 0.1
+    centres_px = np.tile([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0], [9.0, 9.0]], (4, 1, 1))
+    seen = thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], **told)
+    np.testing.assert_allclose(frame_states(seen, memory).power_lag, truth.power_lag)
+    with pytest.raises(ValueError, match="only together with air"):
+        thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], supply=told["supply"])
+    with pytest.raises(ValueError, match="time_ns go backwards"):
+        thermostand.states(model, time_ns=air_ns[::-1], **known)
 
 
 @pytest.mark.nightly

@@ -142,8 +142,12 @@ def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
         rows[0, column] = value
         found = thermal.flags(point, States.from_rows(usual.memory, rows))[0]
         assert found & ~Outside.STATE == flag  # far away enough, and the whole state is unlike any
-    assert thermal.flags(point, 45.0)[0] & Outside.HISTORY
-    assert np.isnan(thermal.shift(point, 45.0)).all()
+    unknown = States.at_degC(45.0, 1, thermal.memory)
+    assert thermal.flags(point, unknown)[0] & Outside.HISTORY
+    assert np.isnan(thermal.shift(point, unknown)).all()
+    for ask in (thermal.correct, thermal.shift, thermal.covariance, thermal.flags):
+        with pytest.raises(ValueError, match="temperature alone does not say it"):
+            ask(point, 45.0)
 
 
 def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, thermal: ThermalModel):
