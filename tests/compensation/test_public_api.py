@@ -189,10 +189,11 @@ def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings(
     is_on = ((hours < 3) | (hours >= 5)).astype(float)
     own_degC = np.where(is_on > 0, 24 + 15 * -np.expm1(-np.where(hours < 3, hours, hours - 5) / 0.4), np.nan)
     frames = np.isin(air_ns, air_ns[[10, 60, 170, 312]])
-    known: dict[str, Any] = {"air": (air_ns, np.full(len(air_ns), 24.0))}
-    told = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
+    air = (air_ns, np.full(len(air_ns), 24.0))
+    known: dict[str, Any] = {"air": air}
+    told: dict[str, Any] = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
     memory = Memory((1620.0,), (), 15.0)
-    history = History(*known["air"], air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
+    history = History(*air, air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
     truth = states_at(history, memory, air_ns[frames], own_degC[frames])
     model: Any = SimpleNamespace(memory=memory)
     found = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **told)
