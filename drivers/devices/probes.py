@@ -96,7 +96,7 @@ class Probe:
         line = SerialSettings(
             settings.baud or as_delivered.baud, as_delivered.stopbits, as_delivered.parity, as_delivered.databits
         )
-        self._client = LineClient.at(name, settings.address, line, settings.timeout_s, _GAP_S)
+        self._client = LineClient.at(name, settings.address, line, (settings.timeout_s, _GAP_S))
 
     async def open(self) -> None:
         """Which unit answers; Refused when it is another one."""

@@ -15,7 +15,9 @@ class LinkFaults:
     its first half, sending 7 random bytes before it; late: of sending it late_by_s late. delay_s: real seconds of
     lateness of every reply (a wire time, not a simulated one); late_s: of the next one alone. garbled: how many of the
     coming replies lose their second half. echo: the request comes back before the reply (a badly wired RS-485
-    adapter). byte_by_byte: one write a byte. `injected` counts what was done, by name.
+    adapter). byte_by_byte: one write a byte. flow_control: XOFF and XON among the reply. Over TCP: hangs_up: each
+    connection is closed after one reply; swallows_first: the first request over each is lost. `injected` counts what
+    was done, by name.
     """
 
     seed: int = 0
@@ -31,6 +33,9 @@ class LinkFaults:
     garbled: int = 0
     echo: bool = False
     byte_by_byte: bool = False
+    flow_control: bool = False
+    hangs_up: bool = False
+    swallows_first: bool = False
     injected: dict[str, int] = field(default_factory=dict[str, int])
 
     def __post_init__(self) -> None:
@@ -69,12 +74,16 @@ class LinkFaults:
         if self.echo:
             self._count("echo")
             reply = request + reply
+        if self.flow_control:
+            self._count("flow_control")
+            reply = b"\x13" + reply[:2] + b"\x11" + reply[2:] + b"\x13\x11"
         return [bytes([byte]) for byte in reply] if self.byte_by_byte else [reply]
 
     @property
     def _is_sound(self) -> bool:
         probable = self.drop or self.flip or self.cut or self.junk or self.late
         other = self.silent or self.delay_s or self.late_s or self.garbled or self.echo or self.byte_by_byte
+        other = other or self.flow_control
         return not (probable or other)
 
     def _chance(self, probability: float, name: str) -> bool:

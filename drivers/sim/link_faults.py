@@ -23,6 +23,9 @@ LINK_FAULTS: dict[str, tuple[object, object, str]] = {
     "garbled": (3, 0, "so many of the coming replies lose their second half"),
     "echo": (True, False, "the request comes back before the reply"),
     "byte_by_byte": (True, False, "one write a byte"),
+    "flow_control": (True, False, "XOFF and XON come among the replies"),
+    "hangs_up": (True, False, "over TCP: each connection is closed after one reply"),
+    "swallows_first": (True, False, "over TCP: the first request over each connection is lost"),
     "unplugged": (True, False, "connections are cut, and nobody listens; plugged in again by another port"),
 }
 
@@ -46,7 +49,7 @@ def set_link_fault(link: Link, kind: str, value: object) -> None:
         case "mixed":
             for each in _MIXED:
                 setattr(link.faults, each, float(str(value or 0)) / len(_MIXED))
-        case "silent" | "echo" | "byte_by_byte":
+        case "silent" | "echo" | "byte_by_byte" | "flow_control" | "hangs_up" | "swallows_first":
             setattr(link.faults, kind, bool(value))
         case "garbled":
             link.faults.garbled = int(str(value or 0))

@@ -160,9 +160,16 @@ class TcpWire:
     def _serve(self, connection: socket.socket) -> None:
         engine = self._make_engine()
         with contextlib.suppress(OSError), connection:
+            is_first = True
             while request := connection.recv(65536):
-                for piece in self._faults.apply(request, engine.feed(request)):
+                if self._faults.swallows_first and is_first:
+                    is_first = False
+                    continue
+                pieces = self._faults.apply(request, engine.feed(request))
+                for piece in pieces:
                     connection.sendall(piece)
+                if self._faults.hangs_up and pieces:
+                    break
         with self._lock:
             self._connections.discard(connection)
 

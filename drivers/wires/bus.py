@@ -188,6 +188,7 @@ class Bus:
     def _transact(self, function: Callable[..., Result], *args: object) -> Result:
         """In the lane: wait until the line is free and clean, run one transaction, set when it is free again."""
         self._settle()
+        hang_ups = self._client.hang_ups
         try:
             result = function(*args)
         except WireFault as fault:
@@ -195,6 +196,8 @@ class Bus:
                 self._suspect = True
                 self._free_s = time.monotonic() + self._quarantine_s
             raise
+        finally:
+            self.counters.lines_down += self._client.hang_ups - hang_ups
         self._free_s = time.monotonic() + self._gap_s
         return result
 

@@ -19,6 +19,7 @@ from foundation.errors import Unreachable
 _CONNECT_S = 1.0
 _WRITE_S = 1.0  # a device that takes no bytes must not hold the caller
 _READ_SIZE = 4096
+CLOSING_S = 0.02  # from a reply to the end of its connection: a round trip of a slow network
 
 
 class ByteLink(Protocol):
@@ -109,6 +110,39 @@ def _taken_at_once(port: int, data: bytes) -> int:
         return os.write(port, data)
     except BlockingIOError:
         return 0
+
+
+class HangUps:
+    """Whether a peer closes each connection after one reply, as some gateways do: that says nothing of who answers
+    next, while a connection that breaks otherwise does. is_known: it did so twice in a row."""
+
+    def __init__(self) -> None:
+        self.is_known = False
+        self._replies = self._in_a_row = 0
+        self._is_cleared = False
+
+    @property
+    def is_suspect(self) -> bool:
+        """One reply came over this connection, and no earlier one has carried more."""
+        return self._replies == 1 and not self._is_cleared
+
+    def opened(self) -> None:
+        """A new connection."""
+        self._replies = 0
+
+    def answered(self) -> None:
+        """One more reply over it."""
+        self._replies += 1
+        if self._replies > 1:
+            self._in_a_row, self._is_cleared = 0, True
+
+    def closed(self) -> bool:
+        """The peer has closed it; whether it did after one reply, so that a read may be asked over another one."""
+        if self._replies != 1:
+            return False
+        self._in_a_row += 1
+        self.is_known = self.is_known or self._in_a_row > 1
+        return True
 
 
 def why_closed(error: Exception) -> str:

@@ -7,6 +7,7 @@ baud); the subclasses here wait for the first byte instead and say why a port do
 from __future__ import annotations
 
 import logging
+import select
 import socket
 import struct
 import termios
@@ -19,10 +20,11 @@ import serial
 from pydantic import Field
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
+from pymodbus.framer.rtu import FramerRTU
 from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu.register_message import WriteMultipleRegistersRequest, WriteSingleRegisterRequest
 
-from drivers.wires.link import why_closed
+from drivers.wires.link import CLOSING_S, HangUps, why_closed
 from drivers.wires.modbus_messages import READS, REPLIES, Decoder, WriteCoilWord
 from drivers.wires.registers import Space
 from foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of
@@ -43,6 +45,12 @@ EXCEPTIONS = {
     11: "no answer behind the gateway",
 }
 _EXCEPTION = 0x80  # of the function in a reply
+_SHORTEST_RTU = 4  # bytes of a frame, and more
+RTU_OVER_TCP = (
+    "the reply is a frame of Modbus RTU, and tcp: is Modbus TCP: set the gateway to Modbus TCP (not transparent, not "
+    "RTU over TCP), or make its line a serial port of this computer (by socat or its driver) and give serial:PATH"
+)
+_READS = frozenset({1, 2, 3, 4})
 _HEAD = 7  # bytes before the function over TCP: number, protocol 0, length, unit
 UNANSWERED_EXCEPTIONS = frozenset({6, 10, 11})  # somebody answered, but not the unit, or not now
 
@@ -119,12 +127,12 @@ class TcpClient(ModbusTcpClient):
         deadline_s, heard = time.monotonic() + timeout_s, b""
         while data := self.recv(None):
             heard = trace(False, heard + data)
+            if foreign := _foreign(packet, heard):
+                raise WireFault(FaultKind.GARBLED, foreign)
             if _is_reply(packet, heard) and (reply := self.framer.decoder.decode(heard[_HEAD:])) is not None:
                 return reply
             used, reply = self.framer.handleFrame(heard, request.dev_id, request.transaction_id)
             if reply is not None:
-                if (reply.dev_id, reply.transaction_id) != (request.dev_id, request.transaction_id):
-                    raise ModbusIOException("the reply is to no request of ours")
                 return reply
             heard = heard[used:]
             if time.monotonic() >= deadline_s:
@@ -143,6 +151,18 @@ class TcpClient(ModbusTcpClient):
             for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
                 self.socket.setsockopt(socket.SOL_SOCKET, option, limit)
         return True
+
+    def is_closed(self, wait_s: float = 0.0) -> bool:
+        """Whether the peer has closed the connection, or does within that time: what is written into it is never
+        sent."""
+        try:
+            if self.socket is not None and wait_s > 0:
+                select.select([self.socket], [], [], wait_s)
+            return self.socket is None or not self.socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
 
     def recv(self, size: int | None) -> bytes:
         """What has come; b"" after the time-out."""
@@ -164,6 +184,22 @@ def _is_reply(packet: bytes, heard: bytes) -> bool:
     return is_whole and heard[:4] == packet[:4] and heard[6] == packet[6]
 
 
+def _foreign(packet: bytes, heard: bytes) -> str:
+    """Why what was heard answers another request than this one, or is of another protocol; "" when it may be its
+    reply."""
+    is_rtu = heard[:4] != packet[:4] and heard[:1] == packet[6:7] and len(heard) > _SHORTEST_RTU
+    if is_rtu and FramerRTU.compute_CRC(heard[:-2]) == int.from_bytes(heard[-2:], "big"):
+        return RTU_OVER_TCP
+    if len(heard) <= _HEAD or heard[2:4] != b"\0\0":
+        return ""
+    sent, returned = (int.from_bytes(each[:2], "big") for each in (packet, heard))
+    if returned != sent:
+        return f"the gateway returned transaction number {returned} for {sent}; is it set to Modbus TCP?"
+    if heard[6] != packet[6]:
+        return f"unit {heard[6]} answered where unit {packet[6]} was asked"
+    return ""
+
+
 class ModbusClient:
     """A blocking Modbus master on one line, for one thread. Bounded: a transaction ends within twice the time-out."""
 
@@ -172,6 +208,8 @@ class ModbusClient:
         self._place = place_of(settings.address)
         self.serial = isinstance(self._place, SerialPlace)
         self._client: SerialClient | TcpClient | None = None
+        self.hang_ups = 0  # connections that the peer had closed before the next request
+        self._manners = HangUps()
         self._sent = b""
         self._heard = b""
         self._reads: dict[tuple[int, Space, int, int], ModbusPDU] = {}  # a stand asks for the same again and again
@@ -191,6 +229,18 @@ class ModbusClient:
             text = f"cannot open {self._settings.address}: {why_closed(error)}"
             raise WireFault(FaultKind.LINE_DOWN, text) from error
         self._client = client
+        self._manners.opened()
+
+    def _see_hang_up(self, request: ModbusPDU) -> None:
+        """Let go of a connection that its gateway has closed. One that may close each after a reply is given a moment
+        for it before the first write."""
+        if not isinstance(self._client, TcpClient):
+            return
+        is_read = request.function_code in _READS
+        if self._client.is_closed(0.0 if is_read or not self._manners.is_suspect else CLOSING_S):
+            self._manners.closed()
+            self.hang_ups += 1
+            self.close()
 
     def _make(self) -> SerialClient | TcpClient:
         settings, place = self._settings, self._place
@@ -279,8 +329,12 @@ class ModbusClient:
 
     def _exchange(self, request: ModbusPDU) -> ModbusPDU:
         """Send `request`; its reply, of the same function and unit; raises WireFault."""
+        self._see_hang_up(request)
         self.connect()
         reply = self._execute(request)
+        self._manners.answered()
+        if self._manners.is_known and not self.serial:
+            self.close()  # the gateway is about to, and the next request is not to meet that
         if reply.function_code & 0x7F != request.function_code:
             raise WireFault(FaultKind.GARBLED, f"asked function {request.function_code}, got {reply.function_code}")
         if reply.function_code & _EXCEPTION:

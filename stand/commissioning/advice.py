@@ -22,10 +22,13 @@ def for_unit(error: DeviceError, unit: OnBus, config: StandConfig) -> str:
     """A unit on the bus."""
     bus = config.bus
     line = f"{bus.baud} baud, parity {bus.parity}, {bus.stopbits} stop bit{'s' * (bus.stopbits - 1)}"
+    gateway = "; does the gateway speak Modbus TCP, not RTU over TCP?" if bus.address.startswith("tcp:") else ""
     if isinstance(error, GarbledReply):
-        return f"is the unit set to {line}, is the line terminated, and does no other unit have the number {unit.unit}?"
+        text = f"is the unit set to {line}, is the line terminated, and does no other unit have the number {unit.unit}?"
+        return f"{text}{gateway}"
     if isinstance(error, Unreachable):
-        return f"is it powered, its number {unit.unit} and its line {line}, and are A and B the right way round?"
+        text = f"is it powered, its number {unit.unit} and its line {line}, and are A and B the right way round?"
+        return f"{text}{gateway}"
     return f"set the unit as its register map {unit.registers} says, or take the map of the unit that is there"
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import re
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -12,23 +15,30 @@ from drivers.sim.wire import PtyWire, TcpWire
 from drivers.wires.bus import Bus, BusSettings
 from foundation.clock import VirtualClock, WallClock, seconds_ns
 from foundation.errors import GarbledReply, Unreachable
-from tests.drivers.bus_responder import TIMEOUT_S, Responder, flip, frame, late, read_is_right
+from tests.drivers.bus_responder import TIMEOUT_S, Fault, Responder, flip, frame, late, read_is_right
 
 
 class MbapResponder(Responder):
-    """The same behind a Modbus TCP gateway."""
+    """The same behind a Modbus TCP gateway, which changes each reply as it is told to."""
+
+    change: Fault | None = None
 
     def feed(self, data: bytes) -> bytes:
         reply = super().feed(frame(data[6:]))
-        return data[:4] + (len(reply) - 2).to_bytes(2, "big") + reply[:-2] if reply else b""
+        sent = data[:4] + (len(reply) - 2).to_bytes(2, "big") + reply[:-2] if reply else b""
+        return self.change(data, sent) if self.change is not None and sent else sent
 
 
-class NumberlessResponder(MbapResponder):
-    """Its replies have the transaction number 0, whatever was asked."""
+def numberless(_: bytes, reply: bytes) -> bytes:
+    return bytes(2) + reply[2:]
 
-    def feed(self, data: bytes) -> bytes:
-        reply = super().feed(data)
-        return reply and bytes(2) + reply[2:]
+
+def of_another_unit(_: bytes, reply: bytes) -> bytes:
+    return reply[:6] + b"\x02" + reply[7:]
+
+
+def as_rtu(_: bytes, reply: bytes) -> bytes:
+    return frame(reply[6:])
 
 
 async def test_a_dead_unit_is_skipped_and_probed_at_growing_intervals_and_the_other_keeps_going(
@@ -113,14 +123,43 @@ async def test_over_tcp_a_late_reply_dies_with_its_connection_and_a_hang_up_cost
     await bus.close()
 
 
-async def test_over_tcp_a_reply_without_the_number_of_its_request_is_no_reply() -> None:
-    wire = TcpWire("127.0.0.1", 0, NumberlessResponder, LinkFaults())
-    bus = Bus("gateway", BusSettings(address=f"tcp:127.0.0.1:{wire.port}", timeout_s=TIMEOUT_S), WallClock())
+@asynccontextmanager
+async def behind_gateway(faults: LinkFaults, change: Fault | None = None) -> AsyncGenerator[tuple[Bus, MbapResponder]]:
+    responder = MbapResponder()
+    responder.change = change
+    wire = TcpWire("127.0.0.1", 0, lambda: responder, faults)
+    bus = Bus("gateway", BusSettings(address=wire.address, timeout_s=2.0), WallClock())
     await bus.open()
-    with pytest.raises(GarbledReply):
-        await bus.write_coil("dut", 1, 3, 0xFF00)
-    await bus.close()
-    wire.close()
+    try:
+        yield bus, responder
+    finally:
+        await bus.close()
+        wire.close()
+
+
+async def test_a_gateway_that_closes_after_each_reply_is_read_and_written() -> None:
+    async with behind_gateway(LinkFaults(hangs_up=True)) as (bus, responder):
+        for address in (100, 200, 300):
+            assert await read_is_right(bus, address)
+            await bus.write_register("dut", 1, address, 7)
+        assert [request[1] for request in responder.requests] == [3, 6] * 3
+        assert (bus.counters.silences, bus.counters.garbled) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (numberless, "the gateway returned transaction number 0 for 1; is it set to Modbus TCP?"),
+        (of_another_unit, "unit 2 answered where unit 1 was asked"),
+        (as_rtu, "the reply is a frame of Modbus RTU, and tcp: is Modbus TCP: set the gateway to Modbus TCP"),
+    ],
+)
+async def test_over_tcp_a_reply_to_another_request_is_refused_by_what_is_wrong_with_it(
+    change: Fault, said: str
+) -> None:
+    async with behind_gateway(LinkFaults(), change) as (bus, _):
+        with pytest.raises(GarbledReply, match=re.escape(said)):
+            await bus.write_coil("dut", 1, 3, 0xFF00)
 
 
 async def test_a_second_opener_learns_that_the_port_is_taken(bus: Bus) -> None:

@@ -18,6 +18,7 @@ from tests.drivers.chamber_bench import ALLOWED_DEGC, MAKES, ON_WIRES, WIRES, be
 async def test_a_late_reply_is_never_taken_for_the_next_one(make: str, wire: str, tmp_path: Path):
     async with bench_of(make, wire, tmp_path) as bench:
         await bench.driver.open()
+        await bench.driver.read()  # the first request over a connection is repeated, as over a serial line
         for value_degC in (30.0, 35.0, 40.0):
             bench.faults.hold()
             bench.fake.stuck_degC = value_degC - 1
@@ -70,6 +71,42 @@ async def test_one_whose_connection_another_program_has_is_unreachable_and_back_
             await bench.driver.read()
         bench.line.plug()
         assert (await bench.read())["fault"].value == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "wire", "fault"),
+    [
+        *((make, "tcp", fault) for make in MAKES for fault in ("hangs_up", "swallows_first")),
+        *(
+            (make, wire, "flow_control") for make, wire in ON_WIRES if (make, wire) != ("cts", "tcp")
+        ),  # a byte of its own
+    ],
+)
+async def test_a_line_with_manners_of_its_own_carries_everything(make: str, wire: str, fault: str, tmp_path: Path):
+    async with bench_of(make, wire, tmp_path, timeout_s=0.3) as bench:
+        setattr(bench.faults, fault, True)
+        await bench.driver.open()
+        await bench.driver.set_temperature(30.0)
+        await bench.driver.run()
+        for value_degC in (21.0, 22.5):
+            bench.fake.stuck_degC = value_degC
+            found = await bench.read()
+            assert (found["pv"].value, found["sp"].value, found["fault"].value) == (value_degC, 30.0, 0)
+        assert not set(bench.driver.identity.model) & {"\x11", "\x13"}
+        await bench.driver.stop()
+        assert (bench.fake.setpoint_degC, bench.fake.running) == (30.0, False)
+
+
+async def test_a_flipped_bit_that_looks_like_flow_control_takes_no_digit_away(tmp_path: Path):
+    """0x13 is a 3 but for one bit: 33.00 without it would be 3.00."""
+    async with bench_of("julabo", "serial", tmp_path, timeout_s=0.3) as bench:
+        await bench.driver.open()
+        await bench.driver.read()
+        bench.fake.stuck_degC = 33.0
+        for damaged in (b"\x133.00", b"3\x13.00"):
+            flips = iter([damaged + b"\r\n"])
+            bench.faults.apply = lambda _, reply, flips=flips: [next(flips, reply) if reply == b"33.00\r\n" else reply]
+            assert (await bench.read())["pv"].value == 33.0
 
 
 @pytest.mark.parametrize("make", MAKES)

@@ -54,11 +54,11 @@ class Language(ChamberLanguage):
     not_told = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
 
     def __init__(self, name: str, settings: CtsSettings) -> None:
-        super().__init__(name, settings, SerialSettings(settings.baud, 1, settings.parity))
+        self._is_serial = settings.address.startswith("serial:")  # a frame has no bytes of flow control, bare text may
+        super().__init__(name, settings, SerialSettings(settings.baud, 1, settings.parity), is_text=self._is_serial)
         self._unit = settings.unit
         self._door_reply = settings.door_reply
         self._program_reply, self._ramp_reply = settings.program_reply, settings.ramp_reply
-        self._is_serial = settings.address.startswith("serial:")
         asked = {"P whether a program runs": settings.program_reply, "R1 whether a ramp does": settings.ramp_reply}
         self.in_force_by = ", ".join(
             ("A0 tells the set-point", *(text for text, is_asked in asked.items() if is_asked))

@@ -43,9 +43,10 @@ class ChamberLanguage(ABC):
     in_force_by = ""
     not_told = ""
 
-    def __init__(self, name: str, settings: ChamberUnitSettings, line: SerialSettings) -> None:
+    def __init__(self, name: str, settings: ChamberUnitSettings, line: SerialSettings, *, is_text: bool = True) -> None:
         self._name = name
-        self.client = LineClient.at(name, settings.address, line, settings.timeout_s, settings.gap_s)
+        times_s = settings.timeout_s, settings.gap_s
+        self.client = LineClient.at(name, settings.address, line, times_s, is_text=is_text)
 
     def identity(self) -> str:
         """What it says of itself; "" when it says nothing."""
