@@ -7,11 +7,13 @@
     │   ├── GarbledReply       an answer that cannot be right: CRC, length, wrong unit (retryable)
     │   ├── Refused            the device says no: exception code, errv, access denied
     │   ├── InUse              another run of this machine has it; nothing was touched
-    │   ├── DeviceFault        the device works and reports trouble: sensor break, jam, alarm
+    │   ├── DeviceFault        the device works and reports trouble: sensor break, jam
+    │   │   └── DeviceAlarm    an alarm that it has latched: nothing moves before somebody has looked
     │   ├── Occupied           operated at the unit by hand; it takes no orders until that ends
     │   └── Superseded         a newer command, or making safe, has overtaken this one: not a fault
     ├── Interrupted            the operator ended the run
     ├── StandTripped           the guard has made the stand safe; an operator must clear it
+    │   └── NotCleared         ... and nobody has, in virtual time
     ├── SessionError           a recorded session cannot be read
     ├── DetectionError         no target in the image, or one that is not identified beyond doubt
     └── CalibrationError       observations that do not determine a camera, or a pose
@@ -67,6 +69,10 @@ class DeviceFault(DeviceError):
     """The device reports a fault of its own or of what it moves, heats or measures."""
 
 
+class DeviceAlarm(DeviceFault):
+    """The device has latched an alarm of its own; an operator decides whether it may go on."""
+
+
 class Occupied(DeviceError):
     """A person at the unit has started something there, such as autotuning: it takes no orders until that ends."""
 
@@ -82,6 +88,10 @@ class Interrupted(StandError):
 
 class StandTripped(StandError):
     """The guard has latched: actuators are safe and nothing may move until an operator clears it."""
+
+
+class NotCleared(StandTripped):
+    """A run in virtual time was held until an operator clears the hold, and none came."""
 
 
 class SessionError(StandError):

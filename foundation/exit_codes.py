@@ -1,5 +1,6 @@
 """How a command ends, each with one sentence: 0 as asked, 1 failed or damaged, 2 bad input, 3 a run that is complete
-and recorded but could not be reported, 130 interrupted."""
+and recorded but could not be reported, 4 a run in virtual time that was held and nobody cleared,
+130 interrupted."""
 
 from __future__ import annotations
 
@@ -9,13 +10,14 @@ from contextlib import contextmanager
 
 import typer
 
-from foundation.errors import ConfigError, Interrupted, StandError
+from foundation.errors import ConfigError, Interrupted, NotCleared, StandError
 from foundation.output import output
 from foundation.usage import one_line, tell
 
 FAILED = 1
 BAD_INPUT = 2
 NOT_REPORTED = 3
+NOT_CLEARED = 4
 INTERRUPTED = 130
 
 
@@ -32,6 +34,9 @@ def one_line_errors() -> Generator[None]:
     except Interrupted as error:
         typer.echo(one_line(error), err=True)
         raise typer.Exit(INTERRUPTED) from error
+    except NotCleared as error:
+        _tell(error)
+        raise typer.Exit(NOT_CLEARED) from error
     except (StandError, OSError) as error:
         _tell(error)
         raise typer.Exit(FAILED) from error

@@ -39,6 +39,7 @@ from stand.fault import Fault
 from stand.guarding.frozen import marking_stale
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording, Watch, heat_uncontrolled, intrusion
+from stand.guarding.met_errors import MetErrors
 from stand.guarding.notify import Notifier
 from stand.guarding.rules import Announcements, camera_measured, camera_stale, recorded, vital, watches
 from stand.imaging.camera_supply import SupplyLimits
@@ -112,12 +113,15 @@ class Assembly:
         From now on nothing is permitted without it."""
         announced, stand = announced or Announcements(), self.stand
         self.hub.subscribe(announced.receive)
+        met = MetErrors(device_kinds(self.config))
+        self.hub.subscribe(met)
         guard = Guard(
             stand.safety,
             (
                 *watches(self.config, announced),
                 Watch(intrusion(lambda: stand.chamber.permits.intrusions), action="hold"),
                 *_obeyed(self.devices.regulator),
+                *met.watches,
                 *camera_measured(self.config, frames_to_come),
                 *(recorded(self.config, recording) if recording is not None else ()),
             ),
@@ -129,6 +133,7 @@ class Assembly:
             release,
             stand.cut_camera,
             self.notifier,
+            met,
             vital(self.config),
         )
         stand.chamber.permits.allowed = guard.may_permit

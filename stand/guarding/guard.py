@@ -11,10 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.errors import DeviceError
 from foundation.hub import Hub
 from foundation.items import Event
 from stand.fault import Fault
 from stand.guarding.interlocks import NOT_DURABLE, Watch
+from stand.guarding.met_errors import MetErrors
 from stand.guarding.notify import Notifier
 from stand.safety import Safety
 
@@ -33,6 +35,8 @@ class Guard:
     every trip aborts. A guard that fails aborts. One that `keeps_on` looks on after an abort, which it holds until
     `clear`: that of a stand on which further runs follow.
 
+    met: device errors that steps have met, whose watches are among `watches`.
+
     A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
     wait for a GOOD reading of each of `vital`, the channels that heat depends on, taken since. What is too old
     only because of it is given time to be renewed (Watch.after_gap_s).
@@ -48,6 +52,7 @@ class Guard:
     release: Callable[[], None] | None = None
     cut_camera: Callable[[], None] | None = None
     notifier: Notifier | None = None
+    met: MetErrors = field(default_factory=lambda: MetErrors({}))
     vital: tuple[str, ...] = ()
     keeps_on: bool = False
     held: Fault | None = None  # why the run waits
@@ -71,6 +76,11 @@ class Guard:
         self._follow_hold(faults)
         return True
 
+    def meet(self, error: DeviceError) -> None:
+        """A step has met it: when this returns the stand is held for it, as by its rule, or aborted."""
+        self.met.note(error)
+        self.look()
+
     def may_permit(self) -> bool:
         """Whether heat and cold may be permitted for another while: the guard looks, finds all well, and has fresh
         readings."""
@@ -92,6 +102,7 @@ class Guard:
         What is wrong still trips again, what has no grace time before anything moves. Continuing the run is the
         caller's task."""
         fault, self.held = self.held, None
+        self.met.cleared()
         for watch in self.watches:
             watch.since_ns = None
         if fault is not None:

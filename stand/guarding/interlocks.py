@@ -12,6 +12,7 @@ from foundation.readings import Quality
 from stand.fault import Action, Fault, Readings, value_of
 
 RECORDING_ENDED = "recording_ended"  # the rule after which a run is resumed by itself (writer_restarts.py)
+DEVICE_FAULT, STAGE_ALARM = "device_fault", "stage_alarm"
 NOT_DURABLE = "not_recorded"  # the rule that ends its hold when the disk has caught up
 _CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to clear that
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
@@ -121,7 +122,7 @@ def reported_fault(channel: str) -> Rule:
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         reading = readings.known(channel)
         if reading is not None and reading.value > 0:
-            return Fault("device_fault", f"{channel}: {reading.reason}")
+            return Fault(DEVICE_FAULT, f"{channel}: {reading.reason}")
         return None
 
     return rule
@@ -155,7 +156,7 @@ def stage_alarm(position: str) -> Rule:
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         reading = readings.known(position)
         if reading is not None and reading.cause == "alarm":
-            return Fault("stage_alarm", f"{position}: {reading.reason}")
+            return Fault(STAGE_ALARM, f"{position}: {reading.reason}")
         return None
 
     return rule

@@ -13,7 +13,7 @@ from pathlib import Path
 from foundation.calls import Lane
 from foundation.clock import VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
-from foundation.errors import StandError, StandTripped
+from foundation.errors import NotCleared, StandError, StandTripped
 from foundation.hub import Hub
 from foundation.instants import duration, utc_text
 from foundation.items import Event, Item
@@ -125,9 +125,9 @@ class Guest:
                 open_stand.start()
                 if isinstance(assembly.clock, VirtualClock):
                     limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
-                    watchers.append(
-                        asyncio.create_task(end_endless_holds(assembly.stand.gate, assembly.clock, limit_h))
-                    )
+                    gate, clock = assembly.stand.gate, assembly.clock
+                    endless = end_endless_holds(gate, assembly.hub, clock, lambda: open_stand.latched, limit_h)
+                    watchers.append(asyncio.create_task(endless))
                 stop.started()
                 await watched(executor.run(), [*open_stand.tasks, recording, *watchers])
                 at_last = to_ambient(assembly.stand, assembly.hub, assembly.clock, assembly.config)
@@ -195,6 +195,7 @@ class Guest:
             allowed,
             recorder.lost_of,
             Decider(recorder.directory, clock).decide,
+            open_stand.guard.meet,
         )
         leaving.callback(executor.close)
         return executor
@@ -310,6 +311,8 @@ def _ending(fault: Fault | None, error: BaseException) -> Ended:
     """How a run ended that did not come to its end."""
     if fault is None:
         cause = cause_of(error)
+        if isinstance(cause, NotCleared):
+            return Ended(0, "tripped", f"aborted: {cause}")
         reason = "cancelled" if isinstance(cause, asyncio.CancelledError) else failure_text(cause)
         return Ended(0, "failed", f"failed: {reason}")
     return Ended(0, "stopped" if fault.rule == STOPPED_BY_OPERATOR else "tripped", f"aborted: {fault.text}")

@@ -59,7 +59,7 @@ async def ready(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: H
 
     `commanded`: where the plan put each axis it moved (mm or deg); the others are left alone. An axis is in doubt when
     its motor is without current, its scale is lost, or it stands a step or more elsewhere (stopped by hand); event
-    "re-approached" with the reason. DeviceFault in an alarm.
+    "re-approached" with the reason. DeviceAlarm in an alarm.
     """
     for name, position in commanded.items():
         axis = axes[name]

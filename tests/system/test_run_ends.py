@@ -17,7 +17,7 @@ from types import FrameType
 import pytest
 
 from foundation import calls
-from foundation.errors import DeviceFault, StandTripped
+from foundation.errors import NotCleared, StandTripped
 from foundation.items import Item, StepMark, StepState
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig
@@ -66,13 +66,16 @@ async def test_a_session_says_which_package_has_made_steps_of_its_plan(
     assert start.data["packages"] == ["acme 1.2"]
 
 
-async def test_somebody_is_notified_of_a_step_that_fails(tmp_path: Path, order: Callable[..., Order]):
+async def test_somebody_is_notified_of_a_step_that_fails_and_of_the_run_that_ends_because_nobody_came(
+    tmp_path: Path, order: Callable[..., Order]
+):
     reported, ordered = tmp_path / "reported", order(SHORTER)
     watch = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
-    with pytest.raises(DeviceFault) as caught:
+    with pytest.raises(NotCleared) as caught:
         await run_virtual(telling(ordered, reported), tmp_path / "out", None, watch)
     (directory,) = (tmp_path / "out").iterdir()
-    assert reported.read_text() == f"{directory.name} has failed: {caught.value}\n"
+    (trip,) = [event for event in Session.open(directory).events() if event.kind == "guard.device_fault"]
+    assert reported.read_text().splitlines() == [trip.text, f"{directory.name} has failed: {caught.value}"]
 
 
 async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_complete_run(
@@ -156,7 +159,7 @@ async def test_a_run_leaves_nothing_behind_however_it_ends(tmp_path: Path, order
         await run_virtual(ordered, tmp_path / "stopped", None, stop)
     assert not left_since(before)
     broken = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
-    with pytest.raises(DeviceFault):
+    with pytest.raises(NotCleared):
         await run_virtual(ordered, tmp_path / "failed", None, broken)
     assert not left_since(before)
 

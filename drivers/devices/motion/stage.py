@@ -23,7 +23,7 @@ from drivers.wires.ximc_client import XimcClient
 from foundation.addresses import ByteAddress
 from foundation.calls import Lane, Result
 from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
+from foundation.errors import DeviceAlarm, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from foundation.readings import Quality, Reading
 
 _LINE = SerialSettings(baud=115200, stopbits=2)
@@ -183,7 +183,7 @@ class Axis:
         """Run the controller's homing procedure and make its end the zero of the scale.
 
         Returns the residual: where the scale had this point before, mm or deg (after a power cycle without meaning).
-        DeviceFault in an alarm, or when the procedure does not end homed; Superseded as in move_to.
+        DeviceAlarm in an alarm, DeviceFault when the procedure does not end homed; Superseded as in move_to.
         """
         turn = self._motion.take()
         await self._call(self._check_identity)  # a power cycle may have brought other settings
@@ -199,8 +199,9 @@ class Axis:
     async def move_to(self, position: float) -> None:
         """Move to `position` (mm or deg), the last stretch upwards, from where the play has been taken up.
 
-        Refused outside the limits or when not homed; DeviceFault in an alarm or when the move fails; Superseded when it
-        was made safe or sent elsewhere after this was called, or made safe before and not allowed to move since.
+        Refused outside the limits or when not homed; DeviceAlarm in an alarm, DeviceFault when the move fails;
+        Superseded when it was made safe or sent elsewhere after this was called, or made safe before and not allowed to
+        move since.
         """
         low, high = self._settings.limits
         unit = self.profile.unit
@@ -271,7 +272,9 @@ class Axis:
             if status.alarm or (status.running and self._clock.now_ns() >= deadline_ns):
                 if status.running:  # not every alarm stops the motor by itself, and a STOP at rest would clear it
                     await self._stop()
-                raise DeviceFault(self.name, status.alarm or f"still moving after {limit_s:.0f} s; stopped")
+                if status.alarm:
+                    raise DeviceAlarm(self.name, status.alarm)
+                raise DeviceFault(self.name, f"still moving after {limit_s:.0f} s; stopped")
             if not status.running:
                 return status
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
@@ -282,7 +285,7 @@ class Axis:
     def _refuse_alarm(self, status: _Status) -> None:
         """STOP would clear an alarm, but only an operator may decide that."""
         if status.alarm:
-            raise DeviceFault(self.name, f"{status.alarm}; it must be looked into before anything moves")
+            raise DeviceAlarm(self.name, f"{status.alarm}; it must be looked into before anything moves")
 
     def _units(self, position: int) -> float:
         return position / _MICROSTEPS * self.profile.unit_per_step

@@ -1,8 +1,8 @@
 """Performs what the table of a run says (stand/running/executing/actions.py), and enters the results.
 
 One loop for a run that continues, was held, tripped, killed or resumed: what it remembers is the logbook's state and
-nothing else. What an action raises ends the run, unless something has undone the set-up meanwhile: then the table says
-what is next.
+nothing else. A device error that an action meets is the guard's, which holds the run for it or ends it; then, and when
+something else has undone the set-up meanwhile, the table says what is next. What else an action raises ends the run.
 """
 
 from __future__ import annotations
@@ -88,6 +88,12 @@ from stand.running.memory.journal import Logbook
 from stand.running.memory.state import Plan, RunState, duration_of
 from stand.stand import Stand
 
+
+def unguarded(error: DeviceError) -> None:
+    """Where no guard holds a run, a device error ends it."""
+    raise error
+
+
 _JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
 
 
@@ -96,7 +102,8 @@ class Executor:
 
     `flushed` returns when all that was published is on the disk. `settling` decides when a soak may end early,
     `offsets` gets what has settled. `allowed` raises ConfigError when this stand may not do a plan. `lost` says how
-    many frames of a capture are not on the disk. `decider` makes the decisions of the plan.
+    many frames of a capture are not on the disk. `decider` makes the decisions of the plan. `meet` gets a device error
+    that an action has met, and holds the run for it before it returns, or ends it.
     """
 
     def __init__(
@@ -111,6 +118,7 @@ class Executor:
         allowed: Callable[[Plan], object] = len,
         lost: Callable[[str], int] = lambda _: 0,
         decider: Callable[[Decide], Awaitable[Decided]] = fixed_plan,
+        meet: Callable[[DeviceError], None] = unguarded,
     ) -> None:
         self._stand = stand
         self._hub = hub
@@ -122,6 +130,7 @@ class Executor:
         self._allowed = allowed
         self._lost = lost
         self._decider = decider
+        self._meet = meet
         self._changed = asyncio.Event()  # set, and replaced, when the plan was changed
         if stand.imaging.supply.equilibrium.is_lost:
             self._on_lost_equilibrium()
@@ -204,7 +213,11 @@ class Executor:
             await self._act(action)
         except (DeviceError, Interlocked) as error:
             if self._state.disturbances == state.disturbances:
-                raise
+                if isinstance(error, Interlocked):
+                    raise
+                self._meet(error)
+                if not self._stand.gate.reasons:  # nothing would keep it from being tried again and again
+                    raise
             planned = self._state.step(self._state.under_way)
             if planned is not None and not is_readying:
                 text = f"{kind_of(planned.step)} was broken off by an interlock ({error})"

@@ -6,17 +6,23 @@ cold, and no equilibrium). And in virtual time, where no operator is there, a ho
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError, StandError
+from foundation.errors import DeviceError, NotCleared, StandError
 from foundation.hub import Hub
-from foundation.items import Event
+from foundation.items import Event, Item
 from foundation.tasks import first_of
+from stand.fault import Fault
 from stand.gate import STOPPING, Gate
+from stand.serving.command_event import COMMAND
 from stand.stand import Stand
 
 # Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.
 SHUT_AFTER_S = 48.0
 _LOOK_S = 5.0  # who was on the way when the gate closed may open it later
+_CLEARED_WITHIN_S = 1800.0  # by whoever works with a virtual run: some 30 s of real time
+_ENDLESS_LOOK_S = 30.0
 _AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be worn
 
 
@@ -53,21 +59,40 @@ async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
     return await first_of(gate.passed(), clock.sleep_until(clock.now_ns() + seconds_ns(duration_s))) == 0
 
 
-async def end_endless_holds(gate: Gate, clock: Clock, limit_h: float) -> None:
-    """Raises StandError when the gate has been closed for `limit_h` without interruption; else runs until cancelled."""
-    since_ns: int | None = None
+async def end_endless_holds(
+    gate: Gate, hub: Hub, clock: Clock, latched: Callable[[], Fault | None], limit_h: float
+) -> None:
+    """For virtual time, until cancelled. NotCleared when the hold `latched` needs an operator and no command came for
+    30 min, StandError when the gate has been closed for `limit_h` without interruption."""
+    since_ns: int | None = None  # the gate has been closed
+    waits_ns: int | None = None  # the hold has waited for an operator
 
     def follow(_reason: str, held: bool) -> None:
         nonlocal since_ns
         since_ns = None if not gate.reasons else clock.now_ns() if since_ns is None and held else since_ns
 
+    def receive(item: Item) -> None:
+        nonlocal waits_ns
+        if isinstance(item, Event) and item.kind == COMMAND:
+            waits_ns = None
+
     gate.subscribe(follow)
-    while True:
-        await gate.closed()
-        if since_ns is None:  # it was closed before anybody listened
-            since_ns = clock.now_ns()
-        ends_ns = since_ns + seconds_ns(3600.0 * limit_h)
-        if clock.now_ns() >= ends_ns:
-            reasons = ", ".join(sorted(gate.reasons))
-            raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody continued it")
-        await clock.sleep_until(ends_ns)
+    hub.subscribe(receive)
+    try:
+        while True:
+            await gate.closed()
+            now_ns, fault = clock.now_ns(), latched()
+            since_ns = now_ns if since_ns is None else since_ns
+            if fault is None or fault.ends_itself:
+                waits_ns = None
+            elif waits_ns is None:
+                waits_ns = now_ns
+            elif now_ns - waits_ns >= seconds_ns(_CLEARED_WITHIN_S):
+                minutes = _CLEARED_WITHIN_S / 60
+                raise NotCleared(f"held for {minutes:g} min of virtual time, and nobody cleared it: {fault.text}")
+            if now_ns - since_ns >= seconds_ns(3600.0 * limit_h):
+                reasons = ", ".join(sorted(gate.reasons))
+                raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody continued it")
+            await _opens_within(gate, clock, _ENDLESS_LOOK_S)
+    finally:
+        hub.unsubscribe(receive)

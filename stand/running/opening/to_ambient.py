@@ -7,6 +7,7 @@ It remembers nothing: what is read says whether it is done. A run that is resume
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError
@@ -57,7 +58,8 @@ async def to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandConfig) 
         hub.publish(Event(clock.now_ns(), "warning", "not_at_ambient", text))
     else:
         hub.publish(Event(clock.now_ns(), "info", "at_ambient", "the chamber is at the laboratory's temperature"))
-    await stand.chamber.stop()
+    with suppress(DeviceError):  # the plan is done: what follows makes everything safe until it confirms
+        await stand.chamber.stop()
 
 
 def _ambient_degC(hub: Hub, config: StandConfig) -> float:
