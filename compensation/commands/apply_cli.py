@@ -220,10 +220,11 @@ def _without_history(model: DriftModel) -> DriftModel:
         raise ConfigError(
             f"a model of the form {model.form} needs the thermal state, which is not known here; give --session"
         )
-    left, usual = (" and ".join(f"{px:.3f}" for px in one.discrepancy_px) for one in (model.other, model))
+    left, usual = (" and ".join(f"{px:z.3f}" for px in one.discrepancy_px) for one in (model.other, model))
     say(
         f"the camera's temperature alone: corrected with the paper's form of the model ({model.other.title}), which "
-        f"leaves {left} px along x and y; with the history of a session (--session) the thermal form leaves {usual} px"
+        f"leaves {left} px along x and y beyond the markers' noise, where set-points were left out of its fit; with the "
+        f"history of a session (--session) the thermal form leaves {usual} px"
     )
     return model.other
 
@@ -261,7 +262,7 @@ def _correct_session(model: DriftModel, session: Session, out: Path, frames: str
             name = f"{number:06d}.{form}"
             write_image(out / name, corrected_image(frame.image, model, state), form, frame.image.dtype)
             outside = outside_text(middle_flags(model, state))
-            writer.writerow((name, number, frame.time_ns, f"{frame.camera_degC:.3f}", outside))
+            writer.writerow((name, number, frame.time_ns, f"{frame.camera_degC:z.3f}", outside))
             report(done + 1, name)
 
 

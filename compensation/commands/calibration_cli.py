@@ -87,17 +87,17 @@ def summary(file: CameraFile, target: Target) -> str:
     ]
     fit = file.fit
     lines += [
-        f"residual {1e3 * fit.rms_px:.2f} mpx per coordinate, {fit.ratio:.3f} x the detection sigma "
-        f"({1e3 * fit.detection_sigma_px:.2f} mpx); discrepancy {1e3 * fit.discrepancy_px:.2f} mpx; "
+        f"residual {1e3 * fit.rms_px:z.2f} mpx per coordinate, {fit.ratio:z.3f} x the detection sigma "
+        f"({1e3 * fit.detection_sigma_px:z.2f} mpx); discrepancy {1e3 * fit.discrepancy_px:z.2f} mpx; "
         f"{fit.outliers} outliers",
         "held-out positions, mpx per coordinate: "
-        + ", ".join(f"{score.model} {1e3 * score.rms_px:.2f}" for score in file.scores),
-        f"the halves differ by {1e3 * file.uncertainty.halves_rms_px:.2f} mpx RMS at "
-        f"{file.uncertainty.distance_mm:.0f} mm",
+        + ", ".join(f"{score.model} {1e3 * score.rms_px:z.2f}" for score in file.scores),
+        f"the halves differ by {1e3 * file.uncertainty.halves_rms_px:z.2f} mpx RMS at "
+        f"{file.uncertainty.distance_mm:z.0f} mm",
     ]
     refit = refit_radtan(file.lens)
     lines.append(
-        f"Kalibr's model without k3 differs by {1e3 * refit.rms_px:.2f} mpx RMS, {1e3 * refit.worst_px:.1f} at most"
+        f"Kalibr's model without k3 differs by {1e3 * refit.rms_px:z.2f} mpx RMS, {1e3 * refit.worst_px:z.1f} at most"
     )
     lines.append(target.orientation)
     return "\n".join(lines)

@@ -48,7 +48,7 @@ def residual_quantities(form: str, evaluation: Evaluation | None, scatter_px: Se
     group = "Left after compensation"
     quantities: list[Quantity] = []
     for axis, name in enumerate("IJ"):
-        key, title = f"left_{form}_{name}", f"The {form} form, {name}"
+        key, title = f"left_{form}_{name}", f"The {form} form, {name}: RMS at held-out set-points"
         if evaluation is None or len(evaluation.temperatures) < _FEWEST:
             why = "the sessions do not support this form, or have fewer than three set-points to score it"
             quantities.append(Quantity(key, group, title, "mpx", math.nan, model, (), why))

@@ -51,7 +51,7 @@ def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -
         value = float(warming.moved[-1, motion])
         minutes = warming.since_s[[0, -1]] / 60
         risen_K = max(float(warming.camera_degC[-1] - warming.camera_degC[0]), 1.0)
-        model = f"y at {minutes[1]:.1f} min minus y at {minutes[0]:.1f} min"
+        model = f"y at {minutes[1]:z.1f} min minus y at {minutes[0]:z.1f} min"
         model += " after switching on" if warming.known else " of the recording"
         lines = (
             direct("what does not repeat", "A", math.sqrt(2) * scatter[motion], unit, UNREPEATED),

@@ -66,19 +66,22 @@ def _facts(file: CameraFile) -> Facts:
     fit = file.fit
     return Facts(
         [
-            ("Residual", f"{1e3 * fit.rms_px:.2f} mpx per coordinate, {fit.ratio:.3f} x the detection sigma"),
-            ("Detection sigma", f"{1e3 * fit.detection_sigma_px:.2f} mpx per coordinate, mean of a position's frames"),
-            ("Unexplained", f"{1e3 * fit.discrepancy_px:.2f} mpx per coordinate beyond noise and priors"),
+            ("Residual", f"{1e3 * fit.rms_px:z.2f} mpx per coordinate, {fit.ratio:z.3f} x the detection sigma"),
+            ("Detection sigma", f"{1e3 * fit.detection_sigma_px:z.2f} mpx per coordinate, mean of a position's frames"),
+            ("Unexplained", f"{1e3 * fit.discrepancy_px:z.2f} mpx per coordinate beyond noise and priors"),
             ("Markers", f"{fit.markers} at {len(file.table.linear_mm)} positions, {fit.outliers} outliers left out"),
-            ("Ray model", f"degree {file.rays.degree}, {file.rays.range_mm[0]:.0f} to {file.rays.range_mm[1]:.0f} mm"),
-            ("Halves", f"{1e3 * file.uncertainty.halves_rms_px:.2f} mpx RMS apart"),
+            (
+                "Ray model",
+                f"degree {file.rays.degree}, {file.rays.range_mm[0]:z.0f} to {file.rays.range_mm[1]:z.0f} mm",
+            ),
+            ("Halves", f"{1e3 * file.uncertainty.halves_rms_px:z.2f} mpx RMS apart"),
         ]
     )
 
 
 def _scores(file: CameraFile) -> Table:
     rows = [
-        [score.model, f"{1e3 * score.rms_px:.3f}", f"{1e3 * score.sigma_px:.3f}", str(score.positions)]
+        [score.model, f"{1e3 * score.rms_px:z.3f}", f"{1e3 * score.sigma_px:z.3f}", str(score.positions)]
         for score in file.scores
     ]
     chosen = next((index for index, score in enumerate(file.scores) if score.model == file.model), None)

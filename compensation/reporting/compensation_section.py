@@ -72,12 +72,12 @@ def compensation_section(observations: Observations, evaluation: Evaluation, sco
         [
             (
                 f"{row.chamber_degC:g}",
-                f"{row.camera_degC:.2f}",
+                f"{row.camera_degC:z.2f}",
                 str(row.frames),
-                f"{row.before_px[0]:.3f}",
-                f"{1e3 * row.after_px[0]:.1f}",
-                f"{row.before_px[1]:.3f}",
-                f"{1e3 * row.after_px[1]:.1f}",
+                f"{row.before_px[0]:z.3f}",
+                f"{1e3 * row.after_px[0]:z.1f}",
+                f"{row.before_px[1]:z.3f}",
+                f"{1e3 * row.after_px[1]:z.1f}",
             )
             for row in score.temperatures
         ],
@@ -93,11 +93,11 @@ def model_section(model: ModelNumbers) -> Iterator[Part]:
         [
             ("Form", f"{model.form}: {_FORMS[model.form]}"),
             ("In use", typeset(model.title)),
-            ("Reference", f"camera {model.reference_degC:.2f} °C, chamber {model.reference_chamber_degC:g} °C"),
+            ("Reference", f"camera {model.reference_degC:z.2f} °C, chamber {model.reference_chamber_degC:g} °C"),
             (
                 "Valid for",
-                f"camera {low:.2f} to {high:.2f} °C; I {min(columns):.0f} to {max(columns):.0f} px, "
-                f"J {min(rows):.0f} to {max(rows):.0f} px",
+                f"camera {low:z.2f} to {high:z.2f} °C; I {min(columns):z.0f} to {max(columns):z.0f} px, "
+                f"J {min(rows):z.0f} to {max(rows):z.0f} px",
             ),
             ("Fitted to", ", ".join(model.session_ids)),
             ("Fitted by", f"thermostand {model.software_version}"),
@@ -158,14 +158,14 @@ def _why(model: ModelNumbers) -> str:
         if (tried := [one for one in model.candidates if one.form == form])
     ]
     listed = " and ".join(
-        f"{one.rms_px[0] * 1e3:.1f} / {one.rms_px[1] * 1e3:.1f} mpx (I / J) for the {one.form} form" for one in best
+        f"{one.rms_px[0] * 1e3:z.1f} / {one.rms_px[1] * 1e3:z.1f} mpx (I / J) for the {one.form} form" for one in best
     )
     return f"At temperatures left out, the best leave {listed}. In use is the {model.form} form."
 
 
 def _candidate(one: Candidate) -> tuple[str, ...]:
     name = f"{one.form}: {typeset(one.name.removeprefix(_COMMON))}"
-    rms = (f"{1e3 * value:.1f}" for value in one.rms_px)
+    rms = (f"{1e3 * value:z.1f}" for value in one.rms_px)
     return (name, str(one.terms), *rms)
 
 
@@ -217,4 +217,4 @@ def _another_night(model: ModelNumbers) -> Iterator[tuple[str, ...]]:
 
 
 def _mpx(values_px: tuple[float, float]) -> Iterator[str]:
-    return (f"{1e3 * value:.2f}" for value in values_px)
+    return (f"{1e3 * value:z.2f}" for value in values_px)

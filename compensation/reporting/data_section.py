@@ -35,7 +35,7 @@ def _session(session: SessionNumbers, numbers: Numbers) -> list[tuple[str, str]]
         ("Recorded", f"{utc(session.begin)} to {utc(session.end)} by thermostand {session.software_version}"),
         ("Frames", _frames(session)),
         ("Chamber", ", ".join(f"{value:g}" for value in session.chamber_degC) + " °C"),
-        ("Camera's temperature", "not known" if math.isnan(low) else f"{low:.2f} to {high:.2f} °C"),
+        ("Camera's temperature", "not known" if math.isnan(low) else f"{low:z.2f} to {high:z.2f} °C"),
         ("Markers", _markers(session, numbers)),
     ]
     if session.doubtful > max(1.0, _DOUBTFUL_BY_CHANCE * session.frames):

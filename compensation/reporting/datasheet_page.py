@@ -154,10 +154,10 @@ def _valid(sheet: Datasheet) -> list[Line]:
     columns, rows = facts.hull_px.T
     camera = sheet.camera_degC
     return [
-        ("Air near the camera", f"{low:.1f} to {high:.1f} °C, at rest at set-points"),
-        ("Camera's own sensor", f"{camera[0]:.2f} to {camera[1]:.2f} °C"),
-        ("Image", f"I {columns.min():.0f} to {columns.max():.0f} px, J {rows.min():.0f} to {rows.max():.0f} px"),
-        ("Reference", f"chamber {facts.reference_chamber_degC:g} °C, camera {facts.reference_degC:.2f} °C"),
+        ("Air near the camera", f"{low:z.1f} to {high:z.1f} °C, at rest at set-points"),
+        ("Camera's own sensor", f"{camera[0]:z.2f} to {camera[1]:z.2f} °C"),
+        ("Image", f"I {columns.min():z.0f} to {columns.max():z.0f} px, J {rows.min():z.0f} to {rows.max():z.0f} px"),
+        ("Reference", f"chamber {facts.reference_chamber_degC:g} °C, camera {facts.reference_degC:z.2f} °C"),
         ("Not covered", "other lenses, focus or aperture; another mount; humidity; vibration; ageing"),
     ]
 

@@ -91,7 +91,7 @@ def _titles(found: Sequence[WarmUp]) -> list[str]:
 def _orientation(roll_deg: float) -> str:
     if math.isnan(roll_deg):
         return "camera"
-    return "normal camera" if abs(roll_deg) < _ROLLED_DEG else f"camera rotated by {abs(roll_deg):.1f}°"
+    return "normal camera" if abs(roll_deg) < _ROLLED_DEG else f"camera rotated by {abs(roll_deg):z.1f}°"
 
 
 def _panel(observations: Observations, track: Track, title: str) -> Paths:
@@ -101,7 +101,7 @@ def _panel(observations: Observations, track: Track, title: str) -> Paths:
 def _warm_up_table(numbers: Numbers, several: bool) -> Table:
     i, j = numbers.paper["warm_up_px"]
     rows: list[tuple[str, ...]] = [
-        ("paper (measured), camera not modified", "", "", "", f"{i:.1f}", f"{j:.1f}", "", "")
+        ("paper (measured), camera not modified", "", "", "", f"{i:z.1f}", f"{j:z.1f}", "", "")
     ]
     first_deg = numbers.warm_ups[0].roll_deg
     for one in numbers.warm_ups:
@@ -113,10 +113,10 @@ def _warm_up_table(numbers: Numbers, several: bool) -> Table:
             (
                 name,
                 str(one.frames),
-                f"{(one.end_s - one.begin_s) / _S_PER_MIN:.1f}",
-                f"{begin:.1f} to {end:.1f}",
-                f"{one.drift_px[0]:.3f}",
-                f"{one.drift_px[1]:.3f}",
+                f"{(one.end_s - one.begin_s) / _S_PER_MIN:z.1f}",
+                f"{begin:z.1f} to {end:z.1f}",
+                f"{one.drift_px[0]:z.3f}",
+                f"{one.drift_px[1]:z.3f}",
                 *(_mpx(value) for value in one.left_px),
             )
         )

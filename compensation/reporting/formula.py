@@ -33,7 +33,7 @@ def _paper(model: PaperModel) -> FormulaNumbers:
         "I at the reference = I + Σ c(I)_abc T_a(i) T_b(j) T_c(t)",
         "J at the reference = J + Σ c(J)_abc T_a(i) T_b(j) T_c(t)",
         f"i = 2 (I + 0.5) / {width} − 1,  j = 2 (J + 0.5) / {height} − 1",
-        f"t = (2 T − {low + high:.4f}) / {high - low:.4f},  T: the camera's temperature, °C",
+        f"t = (2 T − {low + high:z.4f}) / {high - low:z.4f},  T: the camera's temperature, °C",
         "T_n: Chebyshev polynomial of degree n; I, J in px, integers are pixel centres",
     )
     sigma = np.sqrt(np.diagonal(model.coefficient_covariance, axis1=1, axis2=2))
@@ -50,8 +50,8 @@ def _thermal(model: ThermalModel) -> FormulaNumbers:
         "J at the reference = J + a₂ + a₅ x + a₆ y + (a₇ x + a₈ y) y",
         f"x = (I − {(width - 1) / 2:g}) / {width / 2:g},  y = (J − {(height - 1) / 2:g}) / {width / 2:g}",
         "a_k = Σ c_kh (f_h − r_h),  f_h: the rows of the table, r_h: the same at the reference",
-        f"T = (camera − {origin:.3f} °C) / {SPAN_K:g} K, its own temperature",
-        f"air(τ) = (air near the camera, through a first-order lag τ, − {air:.3f} °C) / {SPAN_K:g} K",
+        f"T = (camera − {origin:z.3f} °C) / {SPAN_K:g} K, its own temperature",
+        f"air(τ) = (air near the camera, through a first-order lag τ, − {air:z.3f} °C) / {SPAN_K:g} K",
         "camera(τ) = T through such a lag",
         *(["power(τ) = the supply (0 or 1) through such a lag − 1"] if Kind.POWER_LAG in kinds else []),
         "play(r) = T through a dead zone of ± r",

@@ -198,7 +198,7 @@ def significant(value: float, digits: int) -> str:
         return f"{value:g}"
     rounded, exponent = f"{value:.{digits - 1}e}".split("e")
     places = max(digits - 1 - int(exponent), 0)
-    return f"{float(f'{rounded}e{exponent}'):.{places}f}".replace("-", "−")
+    return f"{float(f'{rounded}e{exponent}'):z.{places}f}".replace("-", "−")
 
 
 def typeset(text: str) -> str:

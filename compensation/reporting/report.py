@@ -195,9 +195,9 @@ def stand_section(numbers: Numbers) -> Iterator[Part]:
 def _state(budget: Budget) -> str:
     reference, (low, high) = budget.reference, budget.air_degC
     return (
-        f"reference with air {reference.air_degC:.2f} °C, granite {reference.granite_inside_degC:.2f} °C inside and "
-        f"{reference.granite_outside_degC:.2f} °C outside, artifact {reference.artifact_degC:.2f} °C, laboratory "
-        f"{reference.laboratory_degC:.2f} °C; captures with air of {low:.1f} to {high:.1f} °C."
+        f"reference with air {reference.air_degC:z.2f} °C, granite {reference.granite_inside_degC:z.2f} °C inside and "
+        f"{reference.granite_outside_degC:z.2f} °C outside, artifact {reference.artifact_degC:z.2f} °C, laboratory "
+        f"{reference.laboratory_degC:z.2f} °C; captures with air of {low:z.1f} to {high:z.1f} °C."
     )
 
 
@@ -207,4 +207,4 @@ def _line(one: Contribution) -> tuple[str, ...]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.2f}" if math.isfinite(value) else ""
+    return f"{value:z.2f}" if math.isfinite(value) else ""

@@ -94,4 +94,4 @@ def _gain(numbers: Numbers, score: ScoreNumbers) -> Iterator[Part]:
 
 def _gains(before: Pair, after: Pair) -> Iterator[str]:
     for b, a in zip(before, after, strict=True):
-        yield from (f"{b:.3f}", f"{a:.3f}" if a >= 0.01 else f"{a:.4f}", percent(improvement_percent(b, a)))
+        yield from (f"{b:z.3f}", f"{a:z.3f}" if a >= 0.01 else f"{a:z.4f}", percent(improvement_percent(b, a)))

@@ -15,9 +15,9 @@ from compensation.reporting.numbers import percent
 from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
 from compensation.validation3d.validate import Validation
-from compensation.validation3d.validation_text import flagged, reason_names
+from compensation.validation3d.validation_text import flagged, reason_names, with_limit
 
-_HEADS = ("Temp.", "Pos.", *(f"{axis} {when}" for when in ("before", "after") for axis in figures.AXES))
+_HEADS = ("Temp., °C", "Pos.", *(f"{axis} {when}, mm" for when in ("before", "after") for axis in figures.AXES))
 
 
 def validation_page(validation: Validation) -> str:
@@ -66,17 +66,17 @@ def gains_table(validation: Validation, ours: str = "this session") -> Table:
 
 def _uncertainties(validation: Validation) -> Table:
     uncertain = [
-        [one.name, *(f"{value:.2f} ± {u:.2f}" for value, u in zip(one.mean_um, one.u_mean_um, strict=True))]
+        [one.name, *(with_limit(value, u) for value, u in zip(one.mean_um, one.u_mean_um, strict=True))]
         for one in validation.variants
     ]
-    return Table(["with standard uncertainty, µm", *figures.AXES], uncertain)
+    return Table(["mean |deviation| and the limit of its standard uncertainty, µm", *figures.AXES], uncertain)
 
 
 def _gains(before_um: Sequence[float], after_um: Sequence[float]) -> Iterator[str]:
     for before, after in zip(before_um, after_um, strict=True):
         yield from (
-            f"{before:.1f}",
-            f"{after:.1f}" if after >= 10 else f"{after:.2f}",
+            f"{before:z.1f}",
+            f"{after:z.1f}" if after >= 10 else f"{after:z.2f}",
             percent(improvement_percent(before, after), 0),
         )
 
@@ -117,17 +117,17 @@ def _rows(validation: Validation) -> Iterator[list[str]]:
 def _paper_rows() -> Iterator[list[str]]:
     for one in TABLE_1:
         for position, pair in enumerate(zip(one.before_mm, one.after_mm, strict=True)):
-            cells = (f"{value:.4f}" for value in chain(*pair))
+            cells = (f"{value:z.4f}" for value in chain(*pair))
             yield [_degC(one.camera_degC) if position == 0 else "", f"V{position}", *cells]
-        yield ["", "aver (abs)", *(f"{value:.4f}" for value in (*one.mean_before_mm, *one.mean_after_mm))]
+        yield ["", "aver (abs)", *(f"{value:z.4f}" for value in (*one.mean_before_mm, *one.mean_after_mm))]
 
 
 def _mm(values_um: Sequence[Float]) -> list[str]:
-    return [f"{value / 1e3:.4f}" if np.isfinite(value) else "-" for value in np.concatenate(values_um)]
+    return [f"{value / 1e3:z.4f}" if np.isfinite(value) else "-" for value in np.concatenate(values_um)]
 
 
 def _degC(value: float) -> str:
-    return f"{value:.2f}"
+    return f"{value:z.2f}"
 
 
 def _other(validation: Validation) -> Table:
@@ -149,7 +149,7 @@ def _numbers(values: Float, digits: int) -> list[str]:
 
 def _facts(validation: Validation) -> list[tuple[str, str]]:
     positions = ", ".join(
-        f"{name} {linear:.3f} mm {rotary:.3f}° (at {distance:.0f} mm)"
+        f"{name} {linear:z.3f} mm {rotary:z.3f}° (at {distance:z.0f} mm)"
         for name, linear, rotary, distance in zip(
             validation.names, validation.linear_mm, validation.rotary_deg, validation.distance_mm, strict=True
         )
@@ -163,8 +163,8 @@ def _facts(validation: Validation) -> list[tuple[str, str]]:
         ("Outside because of", ", ".join(reasons) or "nothing"),
         (
             "Misfit of the poses",
-            f"chi {np.nanmean(validation.before.chi):.2f} before, "
-            f"{np.nanmean(validation.after.chi):.2f} after; 1 when noise explains it",
+            f"chi {np.nanmean(validation.before.chi):z.2f} before, "
+            f"{np.nanmean(validation.after.chi):z.2f} after; 1 when noise explains it",
         ),
         ("Drift model's errors", "taken as a smooth field, alike over half of the image's width"),
     ]

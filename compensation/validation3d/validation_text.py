@@ -22,7 +22,7 @@ def summary(validation: Validation) -> str:
         _paper_line("paper, after", AFTER_mm, width),
     ]
     for one in validation.variants:
-        cells = (f"{value:.2f} +- {u:.2f}" for value, u in zip(one.mean_um, one.u_mean_um, strict=True))
+        cells = (with_limit(value, u) for value, u in zip(one.mean_um, one.u_mean_um, strict=True))
         lines.append(f"{one.name:<{width}}" + "".join(f"{cell:>17}" for cell in cells))
     table_um, rotation_mrad = validation.after.table_um, validation.after.mean_rotation_mrad
     lines += [
@@ -31,6 +31,11 @@ def summary(validation: Validation) -> str:
         flagged(validation),
     ]
     return "\n".join(lines)
+
+
+def with_limit(value_um: float, u_um: float) -> str:
+    """A mean absolute value, which is never below 0, so that no symmetrical interval belongs to it: 0.10 (u ≤ 0.69)."""
+    return f"{value_um:.2f} (u ≤ {u_um:.2f})"
 
 
 def flagged(validation: Validation) -> str:

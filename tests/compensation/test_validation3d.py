@@ -191,7 +191,7 @@ def test_table_figures_and_document_show_the_papers_beside_ours(validated: Valid
     text = summary(validated)
     assert "paper, after" in text
     assert text.splitlines()[3].split() == ["paper,", "after", "12.4", "25.4", "28.7"]
-    assert f"{validated.after.mean_um[2]:.2f} +- {validated.after.u_mean_um[2]:.2f}" in text
+    assert f"{validated.after.mean_um[2]:.2f} (u ≤ {validated.after.u_mean_um[2]:.2f})" in text
     page = validation_page(validated)
     rows = cells(page)
     assert page.count("<svg") == 2

@@ -71,7 +71,7 @@ def normalised_histogram(calibration: Calibration) -> Figure:
         for axes, own, colour, name in zip(panels, values.T, (I_COLOUR, J_COLOUR), ("x", "y"), strict=True):
             rms = float(np.sqrt(np.mean(own**2)))
             axes.hist(
-                own, bins.tolist(), density=True, color=colour, alpha=0.4, linewidth=0, label=f"{name}, RMS {rms:.3f}"
+                own, bins.tolist(), density=True, color=colour, alpha=0.4, linewidth=0, label=f"{name}, RMS {rms:z.3f}"
             )
             axes.plot(bins, normal, color="black", linewidth=0.9, label="normal")
             axes.set_xlabel("residual over detection sigma")

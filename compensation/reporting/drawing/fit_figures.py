@@ -112,9 +112,9 @@ def histogram(evaluation: Evaluation) -> Figure:
         for index, (name, colour) in enumerate(COORDINATES):
             before, after = evaluation.before_px[:, index], 1e3 * evaluation.after_px[:, index]
             rms = evaluation.rms_before_px[index], 1e3 * evaluation.rms_after_px[index]
-            panels[index].hist(before, _BINS, color=colour, alpha=0.4, label=f"before, RMS {rms[0]:.3f} px")
+            panels[index].hist(before, _BINS, color=colour, alpha=0.4, label=f"before, RMS {rms[0]:z.3f} px")
             panels[index].set_xlabel(f"deviation along {name} (px)")
-            panels[2 + index].hist(after, _BINS, color=colour, label=f"after, RMS {rms[1]:.1f} mpx")
+            panels[2 + index].hist(after, _BINS, color=colour, label=f"after, RMS {rms[1]:z.1f} mpx")
             panels[2 + index].set_xlabel(f"deviation along {name} (mpx)")
         for axes in panels:
             legend_above(axes)

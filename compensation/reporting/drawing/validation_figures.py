@@ -36,7 +36,7 @@ def bars(validation: Validation) -> Figure:
                 axes.bar(place + side, height, 0.4, yerr=u, color=colour, error_kw={"lw": 0.8}, label=name)
                 label = f"mean of the paper's, {name}"
                 axes.axhline(1e3 * paper_mm[axis], color=colour, linewidth=0.9, linestyle="--", label=label)
-            labels = [f"{degC:.1f}" for degC in validation.camera_degC[order]]
+            labels = [f"{degC:z.1f}" for degC in validation.camera_degC[order]]
             axes.set_xticks(place, labels, rotation=90, fontsize=7)
             axes.grid(visible=False, axis="x")
             _label(axes, axis)
