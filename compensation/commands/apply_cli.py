@@ -223,7 +223,7 @@ def _without_history(model: DriftModel) -> DriftModel:
     left, usual = (" and ".join(f"{px:z.3f}" for px in one.discrepancy_px) for one in (model.other, model))
     say(
         f"the camera's temperature alone: corrected with the paper's form of the model ({model.other.title}), which "
-        f"leaves {left} px along x and y beyond the markers' noise, where set-points were left out of its fit; with the "
+        f"leaves {left} px along x and y beyond the markers' noise, at set-points left out of its fit; with the "
         f"history of a session (--session) the thermal form leaves {usual} px"
     )
     return model.other
