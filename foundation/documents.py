@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from foundation.document_faults import sentences, words_for_numbers, yaml_fault
-from foundation.errors import ConfigError, SessionError
+from foundation.errors import ConfigError, NotThere, SessionError
 from foundation.files import unreadable
 
 if TYPE_CHECKING or not yaml.__with_libyaml__:
@@ -102,7 +102,8 @@ def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
     try:
         return read(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise SessionError(unreadable(path, error)) from error
+        kind = NotThere if isinstance(error, FileNotFoundError) else SessionError
+        raise kind(unreadable(path, error)) from error
     except ValidationError as error:
         fault = error.errors()[0]
         where = ".".join(str(part) for part in fault["loc"]) or "the file"

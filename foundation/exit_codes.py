@@ -1,6 +1,6 @@
-"""How a command ends, each with one sentence: 0 as asked, 1 failed or damaged, 2 bad input, 3 a run that is complete
-and recorded but could not be reported, 4 a run in virtual time that was held and nobody cleared,
-130 interrupted."""
+"""How a command ends, each with one sentence (with --json also as a document): 0 as asked, 1 failed or damaged, 2 bad
+input, 3 a run that is complete and recorded but could not be reported, 4 a run in virtual time that was held and nobody
+cleared, 130 interrupted."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 import typer
 
-from foundation.errors import ConfigError, Interrupted, NotCleared, StandError
+from foundation.errors import ConfigError, Interrupted, NotCleared, NotThere, StandError
 from foundation.output import output
-from foundation.usage import one_line, tell
+from foundation.usage import ended, failed
 
 FAILED = 1
 BAD_INPUT = 2
@@ -23,30 +23,25 @@ INTERRUPTED = 130
 
 @contextmanager
 def one_line_errors() -> Generator[None]:
-    """What is raised inside becomes its sentence on standard error and its exit status."""
+    """What is raised inside becomes its sentence and its exit status."""
     try:
         yield
-    except ConfigError as error:
-        _tell(error)
-        raise typer.Exit(BAD_INPUT) from error
+    except (ConfigError, NotThere) as error:
+        raise _failed(error, BAD_INPUT) from error
     except BrokenPipeError:  # the reader of our output has closed it; typer ends quietly
         raise
     except Interrupted as error:
-        typer.echo(one_line(error), err=True)
-        raise typer.Exit(INTERRUPTED) from error
+        raise ended(error, INTERRUPTED) from error
     except NotCleared as error:
-        _tell(error)
-        raise typer.Exit(NOT_CLEARED) from error
+        raise _failed(error, NOT_CLEARED) from error
     except (StandError, OSError) as error:
-        _tell(error)
-        raise typer.Exit(FAILED) from error
+        raise _failed(error, FAILED) from error
     except KeyboardInterrupt as error:
-        typer.echo("interrupted", err=True)
-        raise typer.Exit(INTERRUPTED) from error
+        raise ended("interrupted", INTERRUPTED) from error
 
 
-def _tell(error: BaseException) -> None:
-    """Its sentence; with -v where it came from first."""
+def _failed(error: BaseException, status: int) -> typer.Exit:
+    """With its sentence; with -v where it came from first."""
     if output().verbose:
         typer.echo("".join(traceback.format_exception(error)), err=True, nl=False)
-    tell(error)
+    return failed(error, status)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import typer
 
 from foundation.json_values import plain
-from foundation.usage import one_line
+from foundation.usage import answer, one_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,7 @@ def output() -> Output:
 def outputting(wanted: Output) -> Generator[None]:
     """`output()` gives this inside."""
     before = _OUTPUT.set(wanted)
+    answer().wanted = wanted.as_json
     try:
         yield
     finally:
@@ -46,6 +47,7 @@ def show(data: object, lines: Iterable[object]) -> None:
     """The result of a command: `data` (values of JSON, dataclasses, arrays; what else there is as text; NaN and
     infinities as null), or the lines."""
     if output().as_json:
+        answer().is_given = True
         typer.echo(json.dumps(plain(data), indent=2, default=str))
         return
     for line in lines:

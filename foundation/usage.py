@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, cast
 
 import typer
@@ -14,10 +17,30 @@ from typer.main import get_group
 
 from foundation.version import installed_version
 
-_INTERRUPTED = 130  # exit_codes.INTERRUPTED, which imports this module
+_BAD_INPUT, _INTERRUPTED = 2, 130  # of exit_codes, which imports this module
 
 # The base of what typer raises for wrong arguments; it exports only this descendant.
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
+
+
+@dataclass(slots=True)
+class Answer:
+    """What is printed for a program: wanted is whether --json was given, also where no argument could be read yet.
+    is_given: the one document of the result is printed."""
+
+    wanted: bool = False
+    is_given: bool = False
+
+
+_ANSWER: ContextVar[Answer | None] = ContextVar("answer", default=None)
+
+
+def answer() -> Answer:
+    """Of the command under way."""
+    found = _ANSWER.get()
+    if found is None:
+        _ANSWER.set(found := Answer())
+    return found
 
 
 class OneLineUsage(TyperGroup):
@@ -25,6 +48,9 @@ class OneLineUsage(TyperGroup):
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **extra: Any) -> Any:
         """Parse the arguments."""
+        if not rest and extra.get("parent") is None:
+            options = args[: args.index("--")] if "--" in args else args
+            _ANSWER.set(Answer("--json" in options))
         if not args:
             return super().make_context(info_name, args, *rest, **extra)
         with _usage_in_one_line():
@@ -91,8 +117,7 @@ def _imported(module: str, name: str) -> Any:
     try:
         group = get_group(importlib.import_module(module).app)
     except KeyboardInterrupt as error:
-        typer.echo("interrupted; nothing was started", err=True)
-        raise typer.Exit(_INTERRUPTED) from error
+        raise ended("interrupted; nothing was started", _INTERRUPTED) from error
     return group.commands.get(name, group)
 
 
@@ -101,14 +126,35 @@ def _usage_in_one_line() -> Generator[None]:
     try:
         yield
     except _UsageError as error:
-        if error.format_message():  # else it has shown its help
-            tell(error.format_message())
-        raise typer.Exit(2) from error
+        if not error.format_message():  # it has shown its help
+            raise typer.Exit(_BAD_INPUT) from error
+        raise failed(error.format_message(), _BAD_INPUT) from error
+
+
+def failed(sentence: object, status: int) -> typer.Exit:
+    """To be raised: the program ends with this status. `error: sentence` is on standard error by then, and with --json
+    a document with both on standard output, unless that has the result already."""
+    tell(sentence)
+    return _answered(sentence, status)
+
+
+def ended(sentence: object, status: int) -> typer.Exit:
+    """As `failed`, of what is nobody's error."""
+    typer.echo(one_line(sentence), err=True)
+    return _answered(sentence, status)
 
 
 def tell(sentence: object) -> None:
     """`error: sentence` on standard error."""
     typer.echo(f"error: {one_line(sentence)}", err=True)
+
+
+def _answered(sentence: object, status: int) -> typer.Exit:
+    asked = answer()
+    if asked.wanted and not asked.is_given:
+        asked.is_given = True
+        typer.echo(json.dumps({"error": str(sentence), "exit_status": status}))
+    return typer.Exit(status)
 
 
 def one_line(sentence: object) -> str:

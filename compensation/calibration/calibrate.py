@@ -15,6 +15,7 @@ from compensation.calibration.model_scores import (
     ModelScore,
     best,
     halves,
+    known_or_why,
     ray_name,
     rays_of,
     score_models,
@@ -36,15 +37,17 @@ class Model(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """The result. scores: of all models at held-out positions. model: the pinhole in use, one of the scores' names.
-    uncertainty, halves: at the mean distance of the target."""
+    """The result. scores: of all models at held-out positions, none when too few are left to tell. model: the pinhole
+    in use. uncertainty, halves: at the mean distance of the target; halves is None when one of them determines no
+    camera. not_known: of scores and halves, why they are not known."""
 
     adjustment: Adjustment
     rays: RayLens
     scores: tuple[ModelScore, ...]
     model: str
     uncertainty: UncertaintyMap
-    halves: Difference
+    halves: Difference | None
+    not_known: tuple[str, ...] = ()
 
     def score(self, model: str) -> ModelScore:
         """The score of a model by its name."""
@@ -56,21 +59,26 @@ def calibrate(
 ) -> Calibration:
     """Adjust, choose pinhole and degree of the rays by held-out positions, and compare the session's halves.
 
+    Without scores the pinhole is Brown's unless `model` says otherwise, and the rays are of the lowest degree.
     sigma: of the table, else a TableSigma as it is. CalibrationError when the positions do not determine a camera.
     """
     board, sigma = board_of(target), sigma or TableSigma()
-    scores = score_models(positions, board, sigma)
+    known, no_scores = known_or_why(lambda: score_models(positions, board, sigma))
+    scores = known or ()
     pinholes = tuple(score for score in scores if score.model in (BROWN, RATIONAL))
-    chosen = {Model.BROWN: BROWN, Model.RATIONAL: RATIONAL}.get(model) or best(pinholes)
+    chosen = {Model.BROWN: BROWN, Model.RATIONAL: RATIONAL}.get(model) or (best(pinholes) if scores else BROWN)
     adjustment = adjust(positions, board, sigma, rational=chosen == RATIONAL)
-    name = best(tuple(score for score in scores if score not in pinholes))
+    name = best(tuple(score for score in scores if score not in pinholes)) if scores else ray_name(min(DEGREES))
     rays = rays_of(adjustment, next(degree for degree in DEGREES if ray_name(degree) == name))
     distance_mm = float(np.mean(adjustment.poses()[1][:, 2]))
+    apart, no_halves = known_or_why(lambda: halves(positions, board, sigma, distance_mm, rational=chosen == RATIONAL))
+    checks = {"how well held-out positions are met": no_scores, "by how much the halves differ": no_halves}
     return Calibration(
         adjustment=adjustment,
         rays=rays,
         scores=scores,
         model=chosen,
         uncertainty=projection_uncertainty(adjustment, distance_mm),
-        halves=halves(positions, board, sigma, distance_mm, rational=chosen == RATIONAL),
+        halves=apart,
+        not_known=tuple(f"{what} is not known: {why}" for what, why in checks.items() if why),
     )

@@ -89,18 +89,19 @@ class ScorePart(Document):
 
 
 class UncertaintyPart(Document):
-    """Standard uncertainty of the projection, root mean square of both coordinates, at evenly spread pixels."""
+    """Standard uncertainty of the projection, root mean square of both coordinates, at evenly spread pixels.
+    halves_rms_px: how far the halves' calibrations differ, null when that is not known."""
 
     distance_mm: float
     x_px: Row
     y_px: Row
     sigma_px: tuple[tuple[float | None, ...], ...]
-    halves_rms_px: float
+    halves_rms_px: float | None
 
 
 class CameraFile(Document):
     """A calibrated camera. names, vector: fx fy cx cy (px) and the distortion; covariance: of the vector, then a step
-    of the table (c mm, l, a, R0 rad, o mm)."""
+    of the table (c mm, l, a, R0 rad, o mm). scores: none when they are not known; not_known: which checks, and why."""
 
     format: Literal["thermostand camera"] = FORMAT
     schema_version: Literal[1] = 1
@@ -119,6 +120,7 @@ class CameraFile(Document):
     rays: RaysPart
     scores: tuple[ScorePart, ...]
     uncertainty: UncertaintyPart
+    not_known: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _fits_together(self) -> CameraFile:
@@ -190,6 +192,7 @@ def camera_file(
         "rays": _rays(calibration.rays),
         "scores": calibration.scores,
         "uncertainty": _uncertainty(calibration),
+        "not_known": calibration.not_known,
     }
     return CameraFile.model_validate(plain(document))
 
@@ -236,7 +239,7 @@ def _uncertainty(calibration: Calibration) -> dict[str, object]:
         "x_px": found.pixels[0, :, 0],
         "y_px": found.pixels[:, 0, 1],
         "sigma_px": found.sigma_px,
-        "halves_rms_px": calibration.halves.rms_px,
+        "halves_rms_px": None if calibration.halves is None else calibration.halves.rms_px,
     }
 
 

@@ -120,10 +120,12 @@ EXPORTS: Mapping[str, Callable[[Pinhole, str, float], str]] = {
 
 
 def write_exports(folder: Path, lens: Pinhole, name: str, rms_px: float) -> None:
-    """Write every export into the folder, made when it is missing; SessionError when the place refuses."""
+    """Write every export into the folder, made when it is missing, once all of them are made; SessionError when the
+    place refuses."""
+    texts = {file: writer(lens, name, rms_px) for file, writer in EXPORTS.items()}
     make_folder(folder)
-    for file, writer in EXPORTS.items():
-        write_whole(folder / file, writer(lens, name, rms_px))
+    for file, text in texts.items():
+        write_whole(folder / file, text)
 
 
 def _ros_matrix(matrix: Float) -> dict[str, object]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,17 @@ class ModelScore:
     rms_px: float
     sigma_px: float
     positions: int
+
+
+Check = TypeVar("Check")
+
+
+def known_or_why(check: Callable[[], Check]) -> tuple[Check | None, str]:
+    """What a check of a result gives, or None and why it cannot be made: the result stands without it."""
+    try:
+        return check(), ""
+    except CalibrationError as error:
+        return None, str(error)
 
 
 def rays_of(adjustment: Adjustment, degree: int) -> RayLens:

@@ -9,6 +9,7 @@ with which chi^2 is 1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,7 +160,11 @@ def _round(
 
 def cross_validated_px(views: Views, board: Board) -> float:
     """Root mean square residual per coordinate of pictures that the calibration has not seen, about the poses found
-    from them, corrected for the poses' six degrees of freedom."""
+    from them, corrected for the poses' six degrees of freedom. CalibrationError when that cannot be told, as the
+    pictures without those that are held out do not determine a camera."""
+    count = len(views.centres_px)
+    if (left := count - math.ceil(count / _FOLDS)) < LEAST_VIEWS:
+        raise CalibrationError(f"of {count} pictures {left} are left when some are held out, {LEAST_VIEWS} are needed")
     fold = np.arange(len(views.centres_px)) % _FOLDS
     squares: list[float] = []
     for number in range(_FOLDS):

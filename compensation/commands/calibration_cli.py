@@ -69,12 +69,14 @@ def calibrate_session(
         positions = observe_positions(opened, used, shown)
     found = calibrate(positions, used, sigma, model)
     file = _file(opened, used.name, found)
-    file.save(out)
+    lines = [summary(file, used)]
+    page = None if report is None else report_page(file, found)
+    if report is not None and page is not None:
+        write_whole(report, page)
     if export is not None:
         write_exports(export, file.lens, file.camera_serial or "camera", file.fit.rms_px)
-    if report is not None:
-        write_whole(report, report_page(file, found))
-    show(file.model_dump(mode="json"), [summary(file, used)])
+    file.save(out)
+    show(file.model_dump(mode="json"), lines)
 
 
 def summary(file: CameraFile, target: Target) -> str:
@@ -90,11 +92,13 @@ def summary(file: CameraFile, target: Target) -> str:
         f"residual {1e3 * fit.rms_px:z.2f} mpx per coordinate, {fit.ratio:z.3f} x the detection sigma "
         f"({1e3 * fit.detection_sigma_px:z.2f} mpx); discrepancy {1e3 * fit.discrepancy_px:z.2f} mpx; "
         f"{fit.outliers} outliers",
-        "held-out positions, mpx per coordinate: "
-        + ", ".join(f"{score.model} {1e3 * score.rms_px:z.2f}" for score in file.scores),
-        f"the halves differ by {1e3 * file.uncertainty.halves_rms_px:z.2f} mpx RMS at "
-        f"{file.uncertainty.distance_mm:z.0f} mm",
     ]
+    if file.scores:
+        scores = ", ".join(f"{score.model} {1e3 * score.rms_px:z.2f}" for score in file.scores)
+        lines.append(f"held-out positions, mpx per coordinate: {scores}")
+    if (apart_px := file.uncertainty.halves_rms_px) is not None:
+        lines.append(f"the halves differ by {1e3 * apart_px:z.2f} mpx RMS at {file.uncertainty.distance_mm:z.0f} mm")
+    lines += file.not_known
     refit = refit_radtan(file.lens)
     lines.append(
         f"Kalibr's model without k3 differs by {1e3 * refit.rms_px:z.2f} mpx RMS, {1e3 * refit.worst_px:z.1f} at most"

@@ -14,6 +14,7 @@ from compensation.datasheet.details import load_details
 from compensation.drift.bump import Bump
 from compensation.drift.choosing import Form, check_request
 from compensation.drift.choosing import fit as fit_model
+from compensation.drift.drift_model import DriftModel
 from compensation.drift.evaluation import Evaluation, evaluate, table
 from compensation.drift.model_file import load_model, save_model
 from compensation.drift.paper_model import MAX_DEGREE
@@ -34,7 +35,7 @@ from compensation.reporting.report import (
 from compensation.reporting.table_positions import table_positions
 from compensation.validation3d.document import load_validation
 from foundation.command_app import App
-from foundation.errors import ConfigError
+from foundation.errors import ConfigError, SessionError
 from foundation.files import check_writable
 from foundation.output import say, show
 from recording.reading.session import Session
@@ -82,7 +83,7 @@ def fit(
     else:
         observations = finding.observed(sessions, camera)
     model = fit_model(observations, degree, form, say)
-    evaluation = evaluate(model, observations)
+    evaluation, unscored = _scored(model, observations)
     save_model(model, out)
     bumps = list(model.facts.bumps)
     unrepeated = find_unrepeated(observations, model.facts.bumps)
@@ -92,8 +93,18 @@ def fit(
     stepped += [f"{one.session_id}: {one.text}" for one in named]
     repeats = model.between_nights if isinstance(model, ThermalModel) else None
     stepped += [] if repeats is None else [repeats.text]
-    lines = [f"{model.form}: {model.title}", *stepped, table(evaluation)]
-    show({**data, "unrepeated": named, "between_nights": repeats, **_scores(evaluation)}, lines)
+    scored = f"what it gains is not known: {unscored}" if evaluation is None else table(evaluation)
+    scores = {"not_scored": unscored} if evaluation is None else _scores(evaluation)
+    lines = [f"{model.form}: {model.title}", *stepped, scored]
+    show({**data, "unrepeated": named, "between_nights": repeats, **scores}, lines)
+
+
+def _scored(model: DriftModel, observations: Observations) -> tuple[Evaluation | None, str]:
+    """What it gains, or None and why that cannot be told: the model stands without it."""
+    try:
+        return evaluate(model, observations), ""
+    except SessionError as error:
+        return None, str(error)
 
 
 def _bump_line(bump: Bump, observations: Observations) -> str:
@@ -171,9 +182,10 @@ def report(
             used, refusal = given, ""
             evaluation = evaluate(given, observations) if can_be_scored(observations) else None
         write_report(out, observations, used, evaluation, extras, draw)
-    if refusal:
+    if used is None and refusal:
         raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
     alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
+    alone = f"the model is not scored: {refusal}" if refusal else alone
     scores = {} if evaluation is None else _scores(evaluation)
     lines = [alone if evaluation is None else table(evaluation)]
     show({"report": out, "numbers": numbers_path(out), **scores}, lines)

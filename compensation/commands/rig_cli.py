@@ -64,12 +64,12 @@ def calibrate_rig_command(
         say_left_out("not used:", failures, doubtful)
         useful = np.any([views.seen.any(axis=1) for views in seen], axis=0)
         found = calibrate_rig([views.part(useful) for views in seen], known_board(board))
-        data = _written(found, folders, export)
         lines = [
             f"{np.count_nonzero(useful)} moments, {len(folders)} cameras",
             *_lines(found, folders),
             board.orientation,
         ]
+        data = _written(found, folders, export)
         show({"cameras": data, "not_used": failures, "doubtful": doubtful, "exports": export}, lines)
 
 
@@ -100,9 +100,9 @@ def _written(found: RigCalibration, folders: list[Path], export: Path) -> list[d
     """Write rig.json and each camera's files; what rig.json says."""
     data = _data(found, folders)
     make_folder(export)
-    write_whole(export / RIG, json.dumps(data, indent=1) + "\n")
     for number, folder in enumerate(folders):
         write_exports(export / folder.name, found.scene.lenses[number], folder.name, found.rms_px(number))
+    write_whole(export / RIG, json.dumps(data, indent=1) + "\n")
     return data
 
 

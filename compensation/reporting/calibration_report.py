@@ -37,7 +37,8 @@ _FIGURES = (
 
 def report_page(file: CameraFile, calibration: Calibration) -> str:
     """The report as HTML text; the same data give the same text."""
-    drawn = [Drawing(draw(calibration), name, caption) for draw, name, caption in _FIGURES]
+    shown = [each for each in _FIGURES if calibration.scores or each[0] is not figures.model_scores]
+    drawn = [Drawing(draw(calibration), name, caption) for draw, name, caption in shown]
     title = f"Calibration of camera {file.camera_serial}"
     parts = [
         Heading(title, 1),
@@ -46,7 +47,8 @@ def report_page(file: CameraFile, calibration: Calibration) -> str:
         _camera(file),
         _facts(file),
         Heading("Held-out positions"),
-        _scores(file),
+        *([_scores(file)] if file.scores else []),
+        *map(Paragraph, file.not_known),
         Heading("Figures"),
         *drawn,
     ]
@@ -63,7 +65,7 @@ def _camera(file: CameraFile) -> Table:
 
 
 def _facts(file: CameraFile) -> Facts:
-    fit = file.fit
+    fit, apart_px = file.fit, file.uncertainty.halves_rms_px
     return Facts(
         [
             ("Residual", f"{1e3 * fit.rms_px:z.2f} mpx per coordinate, {fit.ratio:z.3f} x the detection sigma"),
@@ -74,7 +76,7 @@ def _facts(file: CameraFile) -> Facts:
                 "Ray model",
                 f"degree {file.rays.degree}, {file.rays.range_mm[0]:z.0f} to {file.rays.range_mm[1]:z.0f} mm",
             ),
-            ("Halves", f"{1e3 * file.uncertainty.halves_rms_px:z.2f} mpx RMS apart"),
+            ("Halves", "not known" if apart_px is None else f"{1e3 * apart_px:z.2f} mpx RMS apart"),
         ]
     )
 

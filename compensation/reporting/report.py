@@ -61,20 +61,24 @@ def analyse(
         if model is not None:
             save_model(model, model_path)
         report(3, "written")
-    if refusal:
+    if model is None and refusal:
         raise NoModel(f"no model: {refusal}; {report_path} shows the drift alone")
     return evaluation
 
 
 def fitted(observations: Observations) -> tuple[DriftModel | None, Evaluation | None, str]:
-    """Model and score, or neither; and why frames that are made for a model allow none, "" when there are no such."""
+    """Model and score, a model that cannot be scored, or neither; and why frames that are made for a model allow no
+    model or score, "" when there are no such."""
     if not can_be_fitted(observations):
         return None, None, ""
     try:
         model = fit(observations)
-        return model, evaluate(model, observations), ""
     except SessionError as error:
         return None, None, str(error)
+    try:
+        return model, evaluate(model, observations), ""
+    except SessionError as error:
+        return model, None, str(error)
 
 
 def can_be_fitted(observations: Observations) -> bool:

@@ -20,7 +20,7 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from foundation.errors import SessionError
+from foundation.errors import NotThere, SessionError
 from foundation.items import Event, Item, Original, StepMark
 from foundation.readings import Frame
 from recording.format import messages
@@ -100,11 +100,12 @@ class Session:
         path = Path(path)
         telemetry, frames = (segments_in(path / name, FINISHED) for name in (TELEMETRY, FRAMES))
         if not telemetry and not path.is_dir():
-            raise SessionError(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
+            raise NotThere(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
         if not telemetry:
             count = len(segments_of(path, UNFINISHED))
             unfinished = f", only {count} unfinished ones" if count else ""
-            raise SessionError(f"{path}: not a session: there is no finished segment in {path / TELEMETRY}{unfinished}")
+            kind = SessionError if count else NotThere
+            raise kind(f"{path}: not a session: there is no finished segment in {path / TELEMETRY}{unfinished}")
         return cls(path, telemetry, frames)
 
     @property

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from foundation.command_app import with_parameters
-from foundation.errors import ConfigError, SessionError
+from foundation.errors import ConfigError, NotThere, SessionError
 from stand.serving.client import Server, running_sessions, server_at, server_of
 
 DirectoryArgument = Annotated[
@@ -83,7 +83,9 @@ def _running(directory: Path | None, config: str, *, anywhere: bool) -> Path:
     if inventory(root):
         raise SessionError(f"{root}: no daemon is running this session")
     others = ", ".join(map(str, running_sessions()))
-    raise SessionError(
-        f"{root}: no daemon is running a session there"
+    is_named_wrongly = directory is not None and not directory.exists()
+    kind = NotThere if is_named_wrongly else SessionError
+    raise kind(
+        f"{root}: {'no such folder' if is_named_wrongly else 'no daemon is running a session there'}"
         + (f"; there is one elsewhere, name it: {others}" if others else "")
     )

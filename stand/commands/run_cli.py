@@ -16,7 +16,7 @@ from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.exit_codes import NOT_REPORTED
 from foundation.output import output, say, show
-from foundation.usage import tell
+from foundation.usage import failed
 from recording.repair.salvage import salvage_line
 from stand.commands.checked_cli import warn_unchecked
 from stand.commands.reached import ConfigOption, RecipeArgument, TokenOption, UrlOption
@@ -201,9 +201,8 @@ def _show_session(session: Path, folder: Path, line: str, *, report: bool) -> No
         show({"session": session, "report": folder / REPORT_NAME if report else None}, lines)
     except NotReported as error:
         if output().as_json:
-            show({"session": session, "report": None}, ())
-        tell(error)
-        raise typer.Exit(NOT_REPORTED) from error
+            show({"session": session, "report": None, "error": str(error)}, ())
+        raise failed(error, NOT_REPORTED) from error
 
 
 def _unused(out: Path) -> Path:

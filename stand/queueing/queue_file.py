@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationError
 
 from foundation.documents import Document
-from foundation.errors import SessionError
+from foundation.errors import NotThere, SessionError
 from foundation.files import replace_file
 
 QUEUE_NAME = "queue.json"
@@ -225,7 +225,7 @@ def _opened(path: Path) -> Generator[int]:
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except FileNotFoundError as error:
-        raise SessionError(f"{path.parent}: no such folder; `stand queue add` makes it") from error
+        raise NotThere(f"{path.parent}: no such folder; `stand queue add` makes it") from error
     except OSError as error:
         raise SessionError(f"{path.parent}: its queue cannot be locked ({error.strerror})") from error
     try:

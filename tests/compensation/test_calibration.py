@@ -9,11 +9,14 @@ import pytest
 
 from compensation.calibration.adjustment import Adjustment, adjust
 from compensation.calibration.calibrate import calibrate
+from compensation.calibration.camera_file import camera_file
 from compensation.calibration.model_scores import BROWN, best, halves, rays_of
 from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pose import find_pose
 from compensation.calibration.stage_geometry import TableSigma
 from compensation.calibration.uncertainty import difference, projection_uncertainty
+from compensation.commands.calibration_cli import summary
+from compensation.reporting.calibration_report import report_page
 from foundation.errors import CalibrationError
 
 from .calibration_cases import CENTRE_mm, board, covariances, positions, target_of, translation_errors_um
@@ -73,6 +76,16 @@ def test_board_and_table_are_corrected_beyond_what_was_known_of_them(
         off = (adjustment.scene.points_mm - laboratory.board_mm)[:, :2]
         assert off.std() < 0.0003 < (laboratory.cmm_mm - laboratory.board_mm[:, :2]).std()
         assert np.sqrt(np.mean((off / adjustment.points_sigma_mm[:, :2]) ** 2)) < 1.8
+
+
+def test_few_positions_give_a_camera_though_their_halves_give_none(laboratories: list[Laboratory]):
+    few = positions(laboratories[1]).part(np.isin(np.arange(34), np.linspace(0, 33, 4).round()))
+    found = calibrate(few, target_of(laboratories[1]))
+    assert (found.model, found.halves, len(found.not_known)) == (BROWN, None, 1)
+    file = camera_file(found, camera_serial="1", session_ids=("a",), target_name="drawn", software_version="0")
+    assert file.uncertainty.halves_rms_px is None
+    assert file.not_known[0] in report_page(file, found)
+    assert file.not_known[0] in summary(file, target_of(laboratories[1]))
 
 
 def test_validation_positions_come_out_within_a_micrometre(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from compensation.calibration.board import Board
+from compensation.calibration.exports import EXPORTS
 from compensation.calibration.view_uncertainty import in_words, projection_sigma_um
 from compensation.calibration.views import ViewCalibration, Views, calibrate_views, cross_validated_px
 from compensation.cli import app
@@ -114,6 +116,16 @@ def test_the_command_calibrates_photographs_and_says_how_well(tmp_path: Path):
     words = next(line for line in result.stdout.splitlines() if line.strip().startswith("fx")).split()
     assert abs(float(words[1]) - HALF.f_px) < 4 * float(words[3])
     assert sorted(path.name for path in (tmp_path / "out").iterdir())
+    # Five give a camera; what is left when one is held out does not, and that check alone is not known.
+    few = ["calibrate-photographs", *paths[:5], "--target", "paper-9x6", "--export", str(tmp_path / "few"), "--json"]
+    result = CliRunner().invoke(app, few)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert (found["held_out_px"], bool(found["held_out_not_known"])) == (None, True)
+    assert sorted(path.name for path in (tmp_path / "few").iterdir()) == sorted(EXPORTS)
+    assert abs(found["lens"]["fx"] - HALF.f_px) < 4 * found["lens_sigma"][0]
+    result = CliRunner().invoke(app, [*few[:5], *few[6:8], "--export", str(tmp_path / "none")])
+    assert (result.exit_code, (tmp_path / "none").exists()) == (1, False)
 
 
 def test_pictures_of_two_sizes_are_refused(tmp_path: Path):

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from compensation.cli import app as compensate
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.exit_codes import one_line_errors
+from foundation.exit_codes import BAD_INPUT, one_line_errors
 from foundation.output import output, say, show
 from foundation.version import installed_version
 from stand.commands.command_table import app as stand
@@ -105,3 +105,68 @@ def test_the_shell_completes_commands_and_options(program: str, words: str, foun
     }
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.split() == [found], done.stderr
+
+
+@pytest.mark.parametrize(
+    ("program", "words", "status"),
+    [
+        ("stand", "plan no-such-recipe --json", 2),
+        ("stand", "--json plan no-such-recipe", 2),
+        ("stand", "session info no-such-session --json", 2),
+        ("stand", "session --json nothing", 2),
+        ("stand", "plan --json --no-such-option", 2),
+        ("stand", "queue add --json", 2),
+        ("stand", "status . --json", 1),
+        ("stand", "no-such-command --json", 2),
+        ("compensate", "fit no-such-session -o x.json --json", 2),
+        ("compensate", "apply --json", 2),
+        ("compensate", "calibrate-photographs no.png --target paper-9x6 --export . --json", 1),
+    ],
+)
+def test_an_error_is_json_where_that_was_asked_for(program: str, words: str, status: int, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked = CliRunner().invoke(PROGRAMS[program], words.split())
+    found = json.loads(asked.stdout)
+    assert (asked.exit_code, found["exit_status"]) == (status, status)
+    assert asked.stderr == f"error: {found['error']}\n"
+    plain = CliRunner().invoke(PROGRAMS[program], words.replace("--json", "").split())
+    assert (plain.exit_code, plain.stdout) == (status, "")
+
+
+# What each command is told besides the session that is not there.
+OF_A_SESSION = {
+    "stand resume": "",
+    **{f"stand {verb}": "" for verb in ("status", "watch", "foxglove", "pause", "continue", "clear", "stop")},
+    **{f"stand {verb}": "" for verb in ("session list", "session info", "session verify", "session salvage")},
+    "stand session replay": "",
+    "stand session note": "a note",
+    "stand session tag": "a-tag",
+    "stand session export": "-o out",
+    "stand session trim": "-o out --from +0 --to +1",
+    "compensate fit": "-o m.json",
+    "compensate report": "-o r.html",
+    "compensate datasheet": "-o d.html",
+    "compensate calibrate": "-o c.json",
+    "compensate detect": "-o c.csv",
+    "compensate validate": "-o v.html --camera nowhere --model nowhere",
+    "compensate budget": "",
+    "compensate apply": "nowhere -o p.csv",
+    "compensate anchor": "nowhere -o b.json",
+    "compensate fit-like": "nowhere -o n.json",
+}
+
+
+@pytest.mark.parametrize(("typed", "more"), OF_A_SESSION.items(), ids=list(OF_A_SESSION))
+def test_a_session_that_is_not_there_has_one_status_in_both_programs(typed: str, more: str, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    program, *words = typed.split()
+    asked = CliRunner().invoke(PROGRAMS[program], [*words, "nowhere", *more.split()])
+    assert (asked.exit_code, asked.stdout) == (BAD_INPUT, ""), asked.output
+    assert asked.stderr.startswith("error: nowhere: no such f"), asked.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_command_of_a_session_is_in_that_table():
+    named = {"session", "sessions", "directory", "sources"}
+    found = {typed for typed, command in EACH if named & {each.name for each in command.params[:1]}}
+    assert found - OF_A_SESSION.keys() == {"stand init", "stand session archive", "stand token login"}

@@ -84,11 +84,12 @@ def uncertainty_map(calibration: Calibration) -> Figure:
     """Standard uncertainty of the projection over the image, and the shift between the halves' calibrations."""
     found = calibration.uncertainty
     with style():
-        figure, panels = new_figure(7.4, 3.4, 1, 2)
-        _contours(figure, panels[0], found.pixels, 1e3 * found.sigma_px, "uncertainty of the projection (mpx)")
         shift = calibration.halves
-        length = 1e3 * np.linalg.norm(shift.shift_px, axis=-1) / math.sqrt(2)
-        _contours(figure, panels[1], shift.pixels, length, "difference of the halves (mpx)")
+        figure, panels = new_figure(7.4, 3.4, 1, 1 if shift is None else 2)
+        _contours(figure, panels[0], found.pixels, 1e3 * found.sigma_px, "uncertainty of the projection (mpx)")
+        if shift is not None:
+            length = 1e3 * np.linalg.norm(shift.shift_px, axis=-1) / math.sqrt(2)
+            _contours(figure, panels[1], shift.pixels, length, "difference of the halves (mpx)")
         used = calibration.adjustment.used
         for axes in panels:
             places = calibration.adjustment.positions.centres_px[used]

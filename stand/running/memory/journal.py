@@ -18,11 +18,12 @@ from pathlib import Path
 
 from foundation.calls import Lane, Line
 from foundation.clock import Clock
-from foundation.errors import SessionError
+from foundation.errors import NotThere, SessionError
 from foundation.files import replace_file, sync_folder
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.patience import Patience
+from recording.format.layout import TELEMETRY
 from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, lines_of
 from recording.writing.disk import JOURNAL_LINE, Disk
 from recording.writing.home import FolderLost
@@ -84,7 +85,9 @@ class Journal:
             fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError as error:
             if not directory.exists():
-                raise SessionError(f"{directory}: no such folder") from error
+                raise NotThere(f"{directory}: no such folder") from error
+            if not (directory / TELEMETRY).exists():
+                raise NotThere(f"{directory}: not a session, so there is nothing to resume") from error
             raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
         try:
             if not path.is_file():  # a pipe of that name might never give a byte
