@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from foundation.errors import SessionError
-from foundation.instants import utc_text
 from foundation.items import Event
 from recording.format.restarts import begins_of, is_superseded
 from recording.reading.session import Session
@@ -34,8 +33,8 @@ def check_one_equilibrium(session: Session) -> None:
         if times_ns and min(times_ns) <= gap_ns < max(times_ns):
             raise TwoEquilibria(
                 f"{session.path}: camera minus air was {_kelvin(event, 'before_K')} before the gap at "
-                f"{utc_text(gap_ns)} and {_kelvin(event, 'after_K')} after it; its frames are of two equilibria of the "
-                "camera, and are used together only with --across-gap"
+                f"{session.utc.local_text(gap_ns)} and {_kelvin(event, 'after_K')} after it; its frames are of two "
+                "equilibria of the camera, and are used together only with --across-gap"
             )
 
 

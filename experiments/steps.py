@@ -16,6 +16,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from foundation.document_faults import path_text
 from foundation.errors import ConfigError
 
 
@@ -281,7 +282,7 @@ def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
     try:
         step = TypeAdapter(_KINDS[kind]).validate_python(dict(parameters))
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
+        wrong = "; ".join(f"{path_text(each['loc'])}: {each['msg']}" for each in error.errors())
         raise ConfigError(f"{kind}: {wrong}") from error
     for name, value in asdict(step).items():
         least = 1 if name == "frames" else 0 if name.endswith("_s") else -math.inf

@@ -25,6 +25,7 @@ _ADVICE: Mapping[str, str] = {  # by what PyYAML says
     "unexpected end of stream": "; a quotation mark is not closed",
     "expected ',' or": "; a bracket is not closed, or a comma is missing",
 }
+_KEY = "[key]"
 _NUMBERS = ("float_type", "float_parsing", "int_type", "int_parsing")
 _WORDS: Mapping[str, str] = {
     "missing": "is missing; give it",
@@ -216,8 +217,18 @@ def _sentence(where: str, fault: ErrorDetails, yaml_text: _Written, advice: str)
         details.append(f"got {_shown(value)}")
     if line is not None:
         details.append(f"line {line}")
-    path = ".".join(str(part) for part in place if part != "[key]")
+    path = path_text((*place[:-1], str(place[-1])) if fault["type"] == "invalid_key" else place)
     return f"{where}: {path}: {text}" + (f" ({', '.join(details)})" if details else "")
+
+
+def path_text(place: Iterable[int | str]) -> str:
+    """A place as people read it: entries are counted from 1, as steps are everywhere. Of a key that is a number
+    pydantic says so behind it."""
+    parts = tuple(place)
+    numbered = zip(parts, (*parts[1:], ""), strict=True)
+    return ".".join(
+        str(part + 1 if isinstance(part, int) and behind != _KEY else part) for part, behind in numbered if part != _KEY
+    )
 
 
 def _number(place: Place, value: object, *, whole: bool) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated
 
@@ -37,6 +36,7 @@ from experiments.steps import Role
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.files import check_writable, whole_file
+from foundation.instants import parse_instant
 from foundation.output import say, show
 from foundation.progress import progress
 from markers.image_file import read_image
@@ -48,7 +48,6 @@ ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL", help="A model fi
 TemperatureOption = Annotated[
     float | None, typer.Option("--camera-degC", help="The camera's own temperature, where it was not recorded.")
 ]
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 INDEX_COLUMNS = ("image", "frame", "time_ns", "camera_degC", "outside")
 
 
@@ -61,7 +60,7 @@ def apply_model(
         Path | None, typer.Option(help="Of points with time_ns, or an image: the session that recorded the camera.")
     ] = None,
     time: Annotated[
-        str | None, typer.Option(help="Of an image: when it was taken, UTC (2026-01-01T18:00:00) or time_ns.")
+        str | None, typer.Option(help="Of an image: when it was taken, local time (2026-01-01T18:00:00) or time_ns.")
     ] = None,
     camera_degC: TemperatureOption = None,
     frames: Annotated[
@@ -143,15 +142,14 @@ def _of_image(
 
 
 def _instant_ns(text: str, session: Session) -> int:
-    """time_ns as it is; UTC by the session's clock."""
+    """time_ns as it is; else a time as people write it, local when it names no zone, by the session's clock."""
     if text.isdecimal():
         return int(text)
+    begin_ns = min((step.time_ns for step in session.steps()), default=0)
     try:
-        utc = datetime.fromisoformat(text)
-    except ValueError:
-        raise ConfigError(f"--time {text}: give time_ns, or UTC such as 2026-01-01T18:00:00") from None
-    utc = utc if utc.tzinfo else utc.replace(tzinfo=UTC)
-    return session.utc.stand_ns(round((utc - _EPOCH) / timedelta(microseconds=1)) * 1000)
+        return parse_instant(text, begin_ns, session.utc.stand_ns)
+    except ConfigError as error:
+        raise ConfigError(f"--time {text}: give time_ns, or a time such as 2026-01-01T18:00:00") from error
 
 
 @app.command("export")

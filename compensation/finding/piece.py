@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from compensation.finding.png_rows import decode_rows
 from compensation.one_camera import others_ns
 from foundation.errors import SessionError
-from foundation.instants import utc_text
+from foundation.instants import local_text
 from markers.detection import Detection, DetectionError, Noise, detect, follow, nothing_found, rows_to_follow
 from markers.pixels import Mask
 from markers.target import Target
@@ -174,7 +174,7 @@ def _naming(place: FramePlace) -> Generator[None]:
         with naming(place.path):
             yield
     except SessionError as error:
-        raise SessionError(f"{error}; this was the frame of {utc_text(place.time_ns)}") from error
+        raise SessionError(f"{error}; this was the frame of {local_text(place.time_ns)}") from error
 
 
 def _followed(

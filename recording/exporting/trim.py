@@ -52,7 +52,7 @@ def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     first = next(kept, None)
     if first is None and not places:
         raise SessionError(
-            f"{session.path}: has nothing from {session.utc.utc_text(begin_ns)} to {session.utc.utc_text(end_ns)}; "
+            f"{session.path}: has nothing from {session.utc.date_time(begin_ns)} to {session.utc.local_text(end_ns)}; "
             f"{_range(session)}"
         )
     first_ns = first.time_ns if first is not None else places[0].time_ns
@@ -95,7 +95,7 @@ def _range(session: Session) -> str:
     times_ns = [record.time_ns for record in _telemetry(session)] + [place.time_ns for place in _places(session)]
     if not times_ns:
         return "it is empty"
-    return f"it goes from {session.utc.utc_text(min(times_ns))} to {session.utc.utc_text(max(times_ns))}"
+    return f"it goes from {session.utc.date_time(min(times_ns))} to {session.utc.local_text(max(times_ns))}"
 
 
 def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[Record]:

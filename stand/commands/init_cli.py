@@ -38,7 +38,10 @@ def init(
     ],
     name: Annotated[str, typer.Option(help="Of the stand; else the folder's.")] = "",
     simulated: Annotated[bool, typer.Option("--simulated", help="The simulated stand: nothing is asked.")] = False,
-    bus: Annotated[str, typer.Option(metavar="PORT", help="Of regulator, relays and thermometers (RS-485).")] = "",
+    bus: Annotated[
+        str,
+        typer.Option(metavar="PORT|tcp:HOST:PORT", help="Of regulator, relays and thermometers: RS-485 or a gateway."),
+    ] = "",
     flap: Annotated[str, typer.Option(metavar="SERIAL", help="USB serial number of the flap's controller.")] = "",
     camera: Annotated[str, typer.Option(metavar="ADDRESS", help="Of the GigE camera; asked who it is.")] = "",
     axis: Annotated[
@@ -50,7 +53,7 @@ def init(
 
     Example: stand init my-stand --bus /dev/serial/by-id/usb-FTDI-port0 --camera 192.168.10.2
     """
-    given = Connected(bus, flap, camera, "", tuple(map(_axis, axis or ())))
+    given = Connected(_bus(bus), flap, camera, "", tuple(map(_axis, axis or ())))
     if simulated and given != Connected():
         raise ConfigError("--simulated has devices of its own; leave --bus, --flap, --camera and --axis out")
     is_asked = ask and not simulated and _is_terminal()
@@ -79,6 +82,7 @@ def _asked(given: Connected) -> Connected:
             port = _choose(f"controller of the {name} stage", controllers, _port_text)
             axes += [_axis(f"{name}={port.address}:{_number(port)}")] if port is not None else []
     bus = given.bus or _address(_choose("RS-485 adapter of regulator, relays and thermometers", others, _port_text))
+    bus = bus or _bus(str(typer.prompt("address of their Modbus TCP gateway (empty: none)", default="", err=True)))
     flaps = [device for device in usb if device.vendor == _POLOLU]
     chosen = None if given.flap else _choose("controller of the flap", flaps, _usb_text)
     flap = given.flap or ("" if chosen is None else chosen.serial)
@@ -105,7 +109,17 @@ def _usb_text(device: UsbDevice) -> str:
 
 
 def _address(port: SerialPort | None) -> str:
-    return "" if port is None else port.address
+    return "" if port is None else f"serial:{port.address}"
+
+
+def _bus(text: str) -> str:
+    """As the stand's file has it: a device file is a serial port, anything else a gateway, whose usual port is 502."""
+    text = text.strip()
+    if not text or text.startswith(("serial:", "tcp:")):
+        return text
+    if text.startswith("/") or "/" in text:
+        return f"serial:{text}"
+    return f"tcp:{text}" if ":" in text else f"tcp:{text}:502"
 
 
 def _number(port: SerialPort) -> int:

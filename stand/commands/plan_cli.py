@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import signal
 from dataclasses import asdict
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from typing import Annotated
 
 import typer
 
 from experiments.looks import looks_of
 from experiments.steps import Step, kind_of, parameters_of
-from foundation.clock import NS_PER_S, WallClock
+from foundation.clock import WallClock, seconds_ns
 from foundation.command_app import App
 from foundation.ending import Ending
+from foundation.instants import local_text, utc_text
 from foundation.output import say, show
-from stand.commands.reached import ConfigOption, RecipeArgument
+from stand.commands.reached import ConfigArgument, ConfigOption, ConfigOrOption, RecipeArgument, named_config
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.absent import absences
 from stand.estimating.camera_lines import camera_lines
@@ -44,19 +45,18 @@ def plan(
     learned = load_learned(order.config.recording.directory)
     night = price_night(tuple(order.recipe.plan()), order.config, order.config.recording.directory)
     steps, total_s = night.steps, night.duration_s
-    now = datetime.fromtimestamp(WallClock().now_ns() / NS_PER_S, UTC).astimezone()
-    end = (now + timedelta(seconds=total_s)).isoformat(timespec="seconds")
+    end_ns = WallClock().now_ns() + seconds_ns(total_s)
     totals = {
         "duration_s": total_s,
         "after_s": night.after_s,
         "frames": sum(step.frames for step in steps),
         "bytes": round(sum(step.size_bytes for step in steps)),
-        "end": end,
+        "end": utc_text(end_ns),
     }
     back = [f"then back to the laboratory's temperature, {_hours(night.after_s)}"] if night.after_s else []
     total = (
         f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
-        f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {end}"
+        f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {local_text(end_ns)}"
     )
     lines = camera_lines(order.config)
     looks = looks_of(step.planned for step in steps)
@@ -74,7 +74,8 @@ def plan(
 
 @app.command()
 def simulate(
-    config: Annotated[str, typer.Argument(help="A configuration with a `simulation` section.")] = "simulated",
+    config: ConfigArgument = None,
+    by_option: ConfigOrOption = None,
     fault: Annotated[
         list[str] | None,
         typer.Option("--fault", metavar="NAME[=VALUE][@TIME][:DURATION]", help="Break something; may be repeated."),
@@ -89,7 +90,7 @@ def simulate(
         rows = list_faults()
         show(rows, (f"{row['name']:<32}{json.dumps(row['worst']):<18}{row['text']}" for row in rows))
         return
-    stand_config = load_config(packaged("", config))
+    stand_config = load_config(packaged("", named_config(config, by_option)))
     laboratory, ending = laboratory_of(stand_config, virtual=False, seed=None), Ending(_ENDING)
     planned = (*(stand_config.simulation.faults if stand_config.simulation else ()), *(fault or ()))
     simulator = Simulator({**laboratory, "faults": list(planned)})

@@ -22,6 +22,8 @@ DirectoryOption = Annotated[
 ]
 RecipeArgument = Annotated[str, typer.Argument(help="A recipe file, or the name of an installed one.")]
 ConfigOption = Annotated[str, typer.Option("--config", help="A configuration file, or the name of an installed one.")]
+ConfigArgument = Annotated[str | None, typer.Argument(help="A configuration file, or the name of an installed one.")]
+ConfigOrOption = Annotated[str | None, typer.Option("--config", help="The same, as other commands take it.")]
 UrlOption = Annotated[
     str, typer.Option("--url", help="A stand's address, http://HOST:PORT, instead of its socket here.")
 ]
@@ -34,6 +36,16 @@ OPTIONS: dict[str, tuple[Any, object]] = {
     "url": (UrlOption, ""),
     "token_file": (TokenOption, None),
 }
+
+
+def named_config(argument: str | None, option: str | None, default: str = "simulated") -> str:
+    """The configuration that a command is given as its argument or behind --config; ConfigError when both are and
+    differ, or when neither is given and there is no default."""
+    if not (argument or option or default):
+        raise ConfigError("give the stand's configuration file")
+    if argument is not None and option is not None and argument != option:
+        raise ConfigError(f"{argument} and --config {option}: which one? give one of them")
+    return argument or option or default
 
 
 def on_stand(

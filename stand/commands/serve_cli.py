@@ -20,6 +20,7 @@ from foundation.items import Event, Item
 from foundation.output import Output, json_line, output, say
 from foundation.usage import one_line
 from stand.commands.checked_cli import warn_unchecked
+from stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
 from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.interface_section import load_tokens
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -41,7 +42,8 @@ _HERE = "127.0.0.1"
 
 @app.command()
 def serve(
-    config: Annotated[str, typer.Argument(help="A configuration file, or the name of an installed one.")] = "simulated",
+    configuration: ConfigArgument = None,
+    by_option: ConfigOrOption = None,
     out: Annotated[Path | None, typer.Option(help="Where the sessions go; else recording.directory.")] = None,
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Listen by TCP, too; without it the Unix socket only.")
@@ -59,6 +61,7 @@ def serve(
 
     Example: stand serve laboratory.yaml --out /data/sessions
     """
+    config = named_config(configuration, by_option)
     if port is None and host != _HERE:
         raise ConfigError(f"--host {host}: give --port, too; without one nothing listens there")
     path = packaged("", config)

@@ -15,6 +15,7 @@ from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.files import write_whole
 from foundation.output import say, show
+from stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.serving.presence import STANDS_FOLDER
 
@@ -35,7 +36,8 @@ def service() -> None:
 
 @app.command()
 def install(
-    config: Annotated[str, typer.Argument(help="The stand's configuration file.")],
+    configuration: ConfigArgument = None,
+    by_option: ConfigOrOption = None,
     user: Annotated[str, typer.Option(help="The user it runs as, who owns the sessions.")] = "",
     group: Annotated[str, typer.Option(help="The group of those who may operate the stand; else that user's.")] = "",
     port: Annotated[int | None, typer.Option(help="As of `stand serve`.")] = None,
@@ -46,7 +48,7 @@ def install(
 
     Example: sudo stand service install laboratory.yaml --user operator --yes
     """
-    path = packaged("", config).absolute()
+    path = packaged("", named_config(configuration, by_option, default="")).absolute()
     stand = load_config(path)
     name = user or os.environ.get("SUDO_USER") or os.environ.get("USER") or "root"
     for option, value in (("--user", name), ("--group", group or name)):

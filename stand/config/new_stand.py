@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from foundation.errors import ConfigError
 from stand.config.stand_config import Folder, packaged
@@ -19,6 +18,8 @@ In this order:
     stand run recipe.yaml --config stand.yaml --virtual-time        # a rehearsal in a simulated laboratory
     stand serve stand.yaml --port 8080              # the stand for days; its page is http://127.0.0.1:8080/
     stand run recipe.yaml --config stand.yaml       # one night, from the command line
+
+`stand config schema --out schema` writes the JSON Schemas that their first lines name: an editor checks them by these.
 """
 
 
@@ -33,9 +34,9 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """What a real stand is made of; "" and empty: stays as the installed file has it, to be edited. bus: the serial
-    port of regulator, relays and thermometers. flap: the controller's USB serial number. camera: its address, and the
-    serial number that must answer there."""
+    """What a real stand is made of; "" and empty: stays as the installed file has it, to be edited. bus: the address of
+    regulator, relays and thermometers, `serial:PATH` or, of a Modbus gateway, `tcp:HOST:PORT`. flap: the controller's
+    USB serial number. camera: its address, and the serial number that must answer there."""
 
     bus: str = ""
     flap: str = ""
@@ -63,7 +64,7 @@ def new_stand(name: str, connected: Connected | None) -> dict[str, str]:
 
 def _with_devices(text: str, connected: Connected) -> str:
     if connected.bus:
-        text = _set(text, r"(?<=^bus:)(.*\n  address: )\S+", rf"\g<1>serial:{_literal(connected.bus)}")
+        text = _set(text, r"(?<=^bus:)(.*\n  address: )\S+", rf"\g<1>{_literal(connected.bus)}")
     if connected.flap:
         text = _set(text, r"(?<=^flap:)(.*\n  serial_number: )\S+", rf"\g<1>{_literal(_quoted(connected.flap))}")
     if connected.camera:
@@ -84,12 +85,8 @@ def _set(text: str, pattern: str, by: str) -> str:
 
 
 def _text(folder: Folder, name: str) -> str:
-    """Of an installed file; editors find its schema from anywhere."""
-    path = packaged(folder, name)
-    schemas: Mapping[str, Path] = {each.name: each for each in (packaged("", "simulated").parent / "schema").iterdir()}
-    return _SCHEMA.sub(
-        lambda found: f"$schema={schemas[found[1]]}" if found[1] in schemas else found[0], path.read_text("utf-8")
-    )
+    """Of an installed file; its schema is named beside it, so that the folder may go to any computer."""
+    return _SCHEMA.sub(r"$schema=schema/\1", packaged(folder, name).read_text("utf-8"))
 
 
 def _literal(text: str) -> str:

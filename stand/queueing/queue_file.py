@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
+from foundation.document_faults import path_text
 from foundation.documents import Document
 from foundation.errors import NotThere, SessionError
 from foundation.files import replace_file
@@ -199,7 +200,7 @@ def _load(directory: Path) -> Queue:
 
 def _first_fault(error: ValidationError) -> str:
     fault = error.errors()[0]
-    where = ".".join(map(str, fault["loc"]))
+    where = path_text(fault["loc"])
     return f"{where}: {fault['msg']}" if where else fault["msg"]
 
 

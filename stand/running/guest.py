@@ -15,7 +15,7 @@ from foundation.clock import VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
 from foundation.errors import NotCleared, StandError, StandTripped
 from foundation.hub import Hub
-from foundation.instants import duration, utc_text
+from foundation.instants import duration, local_text
 from foundation.items import Event, Item
 from foundation.tasks import cause_of, failure_text, watched
 from markers.target import Target
@@ -280,7 +280,7 @@ class Guest:
         clock, log = self._assembly.clock, self.log
         now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
         if before.state.ended is None:
-            ended = f"interrupted: killed after {utc_text(last_utc_ns)}"
+            ended = f"interrupted: killed after {local_text(last_utc_ns)}"
             log.tell("error", RUN_END, ended, {"status": Run.INTERRUPTED})
         data: dict[str, object] = {"from_ns": last_utc_ns, "to_ns": now_ns + utc_offset_ns(clock)}
         lasted = duration(now_ns - before.last_ns)

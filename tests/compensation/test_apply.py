@@ -144,7 +144,7 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
     refused(files["paper"], recorded.path, "--frames", "3", says="give FIRST:END")
     refused(files["paper"], recorded.path, "--camera-degC", "3", says="a session has temperatures of its own")
     refused(files["paper"], tmp_path / "photo.png", says="give the camera's temperature with --camera-degC")
-    refused(tmp_path / "none.json", "POINTS", status=1, says="none.json: no such file")
+    refused(tmp_path / "none.json", "POINTS", status=2, says="none.json: no such file")
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((40, 50), np.uint8))
     refused(
         files["paper"],
@@ -253,6 +253,6 @@ def test_an_exported_image_is_corrected_as_the_session_is_at_its_time(
     for given, says in (
         (("--session", recorded.path), "say with --time"),
         (("--time", frame.time_ns, "--camera-degC", 40), "give --session as well"),
-        (("--session", recorded.path, "--time", "noon"), "give time_ns, or UTC"),
+        (("--session", recorded.path, "--time", "noon"), "give time_ns, or a time"),
     ):
         assert says in run("apply", files["paper"], photo, *given, "-o", tmp_path / "none.tiff", status=2)

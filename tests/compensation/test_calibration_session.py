@@ -189,7 +189,7 @@ def test_a_file_that_is_not_a_camera_is_refused(
 def test_bad_input_is_refused_with_a_sentence_and_leaves_nothing(recorded: Recorded, tmp_path: Path):
     out = tmp_path / "camera.json"
     cases = [
-        ([tmp_path, "-o", out], "not a session", 1),
+        ([tmp_path, "-o", out], "not a session", 2),
         ([recorded.path, "-o", tmp_path / "none" / "camera.json"], "cannot be written", 1),
         (
             [recorded.path, "-o", out, "--export", next((recorded.path / "telemetry").iterdir()) / "exports"],

@@ -186,7 +186,7 @@ def test_bad_input_to_detect_is_refused_with_a_sentence(image: Path, recorded: R
     assert_refused(run("detect", tmp_path / "none.png", "-o", out), "none.png: no such file or folder", out, 2)
     assert_refused(run("detect", image, text, "-o", out), "notes.png: not an image", out)
     assert_refused(run("detect", blank, "-o", out), "blank.png: ", out)
-    assert_refused(run("detect", empty, "-o", out), "empty: not a session", out)
+    assert_refused(run("detect", empty, "-o", out), "empty: not a session", out, 2)
     assert_refused(run("detect", image, "--target", "dots", "-o", out), "installed targets: paper-9x6", out, 2)
     assert_refused(run("detect", image, "--target", text, "-o", out), "notes.png: ", out, 2)
     nowhere = tmp_path / "none" / "markers.csv"
@@ -200,7 +200,7 @@ def test_bad_input_to_fit_and_report_is_refused_with_a_sentence(recorded: Record
     shutil.copytree(recorded.path, damaged)
     segment = next((damaged / "frames").iterdir())
     segment.write_bytes(segment.read_bytes()[:1000])
-    assert_refused(run("fit", tmp_path, "-o", out), "not a session", out)
+    assert_refused(run("fit", tmp_path, "-o", out), "not a session", out, 2)
     assert_refused(run("fit", damaged, "-o", out), segment.name, out)
     assert_refused(run("fit", recorded.path, recorded.path, "-o", out), "given twice", out)
     assert_refused(run("report", recorded.path, "--model", model, "-o", out), "model.json: not a drift model", out)

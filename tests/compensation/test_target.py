@@ -53,7 +53,7 @@ def test_measured_coordinates_replace_the_nominal_ones():
         (SMALL + "odd_marker: {number: 1, diameter_mm: 17}\n", "overlaps its neighbours"),
         (SMALL + "donut_markers: {numbers: [1, 2, 13], hole_mm: 2}\n", "three different ones of 1..12"),
         (SMALL + "donut_markers: {numbers: [1, 2, 2], hole_mm: 2}\n", "three different ones of 1..12"),
-        (SMALL + "donut_markers: {numbers: [1, 2], hole_mm: 2}\n", "donut_markers.numbers.2: "),
+        (SMALL + "donut_markers: {numbers: [1, 2], hole_mm: 2}\n", "donut_markers.numbers.3: "),
         (SMALL + "donut_markers: {numbers: [1, 2, 8], hole_mm: 3.5}\n", "0.3 to 0.7 of diameter_mm, not 0.88"),
         (
             SMALL + "donut_markers: {numbers: [1, 5, 9], hole_mm: 2}\n",

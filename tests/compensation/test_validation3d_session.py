@@ -193,7 +193,7 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(folder: Path, rec
         (session, out, ["--camera", str(folder / "model.json")], "not a camera file", 1),
         (session, out, ["--budget", "none.yaml"], "none.yaml", 2),
         (recorded_alone, out, [], "poses were seen at 1 temperature; two are needed", 1),
-        (folder, out, [], "not a session", 1),
+        (folder, out, [], "not a session", 2),
     ]
     for given, path, options, sentence, status in cases:
         result = run(folder, given, path, *options)

@@ -164,8 +164,8 @@ def test_an_impossible_parameter_is_refused_with_a_reason(
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [
-        ({"calibration": {**GRID, "linear_mm": [1, 999]}}, r"experiments\.0\.calibration\.linear_mm\.1"),
-        ({"validation": {**PLACES, "positions": [{}]}}, r"experiments\.0\.validation\.positions\.0\.linear_mm"),
+        ({"calibration": {**GRID, "linear_mm": [1, 999]}}, r"experiments\.1\.calibration\.linear_mm\.2"),
+        ({"validation": {**PLACES, "positions": [{}]}}, r"experiments\.1\.validation\.positions\.1\.linear_mm"),
         ({"calibration": GRID, "warm_up": {}}, "exactly one of warm_up, thermal_cycle, calibration, validation"),
         ({}, "exactly one of"),
     ],

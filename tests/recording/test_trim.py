@@ -120,7 +120,7 @@ async def test_an_empty_part_is_refused_with_what_there_is(tmp_path):
     await record(tmp_path / "s", 4)
     session = Session.open(tmp_path / "s")
     for begin_ns, end_ns in ((0, START_NS - 50 * MS), (START_NS + 1, START_NS + 2), (START_NS + 9, START_NS)):
-        with pytest.raises(SessionError, match=r"has nothing from .* it goes from 2026-01-01T18:00:00\.073456789Z to"):
+        with pytest.raises(SessionError, match=r"has nothing from .* it goes from 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d to"):
             trim(session, tmp_path / "part", begin_ns, end_ns)
     assert [path.name for path in tmp_path.iterdir()] == ["s"]
 

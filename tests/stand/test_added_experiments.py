@@ -1,7 +1,8 @@
 """Experiments of other packages, by entry points: the example of the docs, and packages that are broken."""
 
 import shutil
-import tomllib
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,13 +32,29 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
     return write
 
 
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder into which pip has installed the example, from a wheel that it has built of it."""
+    source, target = tmp_path_factory.mktemp("source") / "staircase", tmp_path_factory.mktemp("installed")
+    shutil.copytree(EXAMPLE, source)
+    options = [
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "--disable-pip-version-check",
+        "--target",
+        str(target),
+    ]
+    command = [sys.executable, "-m", "pip", "install", "-q", *options, str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return target
+
+
 @pytest.fixture
-def staircase(install: Install, tmp_path: Path) -> None:
-    """The example, installed as its pyproject.toml says."""
-    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
-    points = project["entry-points"]["thermostand.experiments"]
-    install("thermostand-staircase", "", "\n".join(f"{name} = {value}" for name, value in points.items()))
-    shutil.copy(EXAMPLE / "staircase.py", tmp_path)
+def staircase(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example, installed."""
+    monkeypatch.syspath_prepend(built)
 
 
 def recipe(entry: str) -> Recipe:
@@ -62,9 +79,9 @@ def test_a_recipe_knows_which_packages_it_depends_on():
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [
-        ("staircase: {stairs: 0}", "own.yaml: experiments.0.staircase.stairs: must be greater than or equal"),
-        ("staircase: {stars: 3}", "own.yaml: experiments.0.staircase.stars: unknown key; correct its name, or take it"),
-        ("staircase: {stair_K: 30}", "own.yaml: experiments.0.staircase: a set-point of 84 degC; give -10 to 70 degC"),
+        ("staircase: {stairs: 0}", "own.yaml: experiments.1.staircase.stairs: must be greater than or equal"),
+        ("staircase: {stars: 3}", "own.yaml: experiments.1.staircase.stars: unknown key; correct its name, or take it"),
+        ("staircase: {stair_K: 30}", "own.yaml: experiments.1.staircase: a set-point of 84 degC; give -10 to 70 degC"),
         ("stairs: {}", "there is no experiment 'stairs'; did you mean staircase? There are warm_up,"),
     ],
 )
@@ -90,10 +107,10 @@ HEAD = "from pydantic import BaseModel\nfrom experiments.steps import *\nclass P
         (f"{HEAD}def own(p: P): yield 'soak'", "step 1 is no step of experiments.steps but str; correct the package"),
         (f"{HEAD}def own(p: P): yield Soak(float('nan'))", "step 1 (Soak) has duration_s nan"),
         (f"{HEAD}def own(p: P): yield Soak(-1.0)", "step 1 (Soak) has duration_s -1.0"),
-        (f"{HEAD}def own(p: P): yield SetTemperature(30.0)", "experiments.0.own: the chamber is stopped here"),
+        (f"{HEAD}def own(p: P): yield SetTemperature(30.0)", "experiments.1.own: the chamber is stopped here"),
         (
             f"{HEAD}def own(p: P):\n    while True: yield OpenFlap()",
-            "experiments.0.own: the plan has more than 100000 steps or 20000 captures here",
+            "experiments.1.own: the plan has more than 100000 steps or 20000 captures here",
         ),
     ],
 )

@@ -60,12 +60,38 @@ def test_at_a_terminal_it_asks_among_what_is_connected(tmp_path: Path, monkeypat
     monkeypatch.setattr(init_cli, "_is_terminal", lambda: True)
     monkeypatch.setattr(init_cli, "serial_ports", lambda: ports)
     monkeypatch.setattr(init_cli, "usb_devices", lambda: (UsbDevice(0x1FFB, 0xB7, "the flap", "00001234"),))
-    done = invoke(tmp_path / "mine", answers="1\n0\n2\n1\n\n")  # linear, rotary, bus, flap, camera
+    done = invoke(
+        tmp_path / "mine", answers="1\n0\n2\n1\n\n"
+    )  # linear, rotary, bus, flap, camera; no gateway, as there is a bus
     assert done.exit_code == 0, done.stderr
     config = checked(tmp_path / "mine")
     assert config.bus is not None
     assert config.bus.address == "serial:/dev/serial/by-id/two"
     assert (config.axes["linear"].serial_number, config.flap.serial_number) == (0x1007, "00001234")
+
+
+@pytest.mark.parametrize("answer", ["10.0.0.9", "tcp:10.0.0.9:502", "10.0.0.9:502"])
+def test_it_asks_for_a_gateway_where_no_adapter_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str):
+    monkeypatch.setattr(init_cli, "_is_terminal", lambda: True)
+    monkeypatch.setattr(init_cli, "serial_ports", tuple)
+    monkeypatch.setattr(init_cli, "usb_devices", tuple)
+    asked = invoke(tmp_path / "asked", answers=f"{answer}\n\n")  # gateway, camera
+    given = invoke(tmp_path / "given", "--no-ask", "--bus", answer)
+    assert (asked.exit_code, given.exit_code) == (0, 0), asked.stderr
+    for folder in ("asked", "given"):
+        config = checked(tmp_path / folder)
+        assert config.bus is not None
+        assert config.bus.address == "tcp:10.0.0.9:502"
+        assert "bus.address" not in given.stderr
+
+
+@pytest.mark.parametrize("more", [("--simulated",), ("--no-ask",)])
+def test_nothing_in_it_is_a_path_of_this_computer(tmp_path: Path, more: tuple[str, ...]):
+    assert invoke(tmp_path / "mine", *more).exit_code == 0
+    texts = [path.read_text() for path in (tmp_path / "mine").iterdir()]
+    named = {line.partition("$schema=")[2] for text in texts for line in text.splitlines() if "$schema=" in line}
+    assert named == {"schema/stand.json", "schema/recipe.json", "schema/target.json"}
+    assert not [text for text in texts if str(Path(init_cli.__file__).parents[2]) in text]
 
 
 def test_nothing_that_is_there_is_overwritten(tmp_path: Path):

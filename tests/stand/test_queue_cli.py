@@ -106,7 +106,7 @@ def test_a_damaged_queue_is_reported_not_shown(tmp_path: Path):
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path):
     refused = invoke(tmp_path / "nowhere", "move", 1, 1)
-    assert refused.exit_code == 1
+    assert refused.exit_code == 2
     assert refused.stderr == f"error: {tmp_path / 'nowhere'}: no such folder; `stand queue add` makes it\n"
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from foundation.items import Event
 from recording.reading.session import Session
+from stand.commands.sessions.session_table import fitting, lines
 from tests.recording.recorded import START_NS, half_second, item_key, record
 from tests.stand.session_commands import COUNT, ask, refused
 
@@ -334,3 +335,17 @@ def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):
 def test_trim_refuses_times_that_are_none(session: Path, tmp_path: Path, times: tuple[str, ...], sentence: str):
     assert sentence in refused("trim", session, "--out", tmp_path / "part", *times)
     assert not (tmp_path / "part").exists()
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 200])
+def test_names_of_sessions_are_whole_however_narrow_the_terminal_is(width: int):
+    columns = ("session", "recipe", "start (local)", "duration", "frames", "size", "devices", "run", "files", "note")
+    row = ("20260101T180000Z-thermal-cycle", "thermal_cycle", "2026-01-01 19:00:00", "11:02:03", "3914", "1.2 GB")
+    table = [(*row, "simulated", "complete", "sound", "a" * 40)]
+    kept, cells, left_out = fitting(columns, table, width)
+    assert [column for column in columns if column in {*kept, *left_out}] == list(columns)
+    assert (kept[0], kept[-2:], cells[0][0]) == ("session", kept[-2:], row[0])
+    assert {"run", "files"} <= set(kept)
+    assert bool(left_out) is (width < 200)
+    if width >= 60:
+        assert max(map(len, lines(kept, cells))) <= width

@@ -68,7 +68,7 @@ def recipe_file(tmp_path: Path, **parameters: object) -> str:
         ({"table_position": {"linear": 290}}, "outside the limits (0.0, 280.0) of linear"),
         ({"interval_s": 0.2, "frames_per_point": 2}, "faster than cameras.camera.frame_rate_hz"),
         ({"dwell_s": 604800, "cycles": 60}, "the plan takes 420 days"),
-        ({"dwel_s": 3}, "experiments.0.thermal_cycle.dwel_s: unknown key"),
+        ({"dwel_s": 3}, "experiments.1.thermal_cycle.dwel_s: unknown key"),
     ],
 )
 def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(

@@ -217,6 +217,6 @@ def test_a_queue_that_names_another_folder_is_refused_and_nothing_is_run(tmp_pat
         refused = CliRunner().invoke(app, ["queue", *command, "--out", str(out)], catch_exceptions=False)
         assert refused.exit_code == 1
         (line,) = refused.stderr.splitlines()
-        assert f"{file}: is damaged (entries.0.session: " in line
+        assert f"{file}: is damaged (entries.1.session: " in line
         assert refused.stdout == ""
     assert {path for path in tmp_path.rglob("*") if not path.name.startswith(".")} <= set(before)

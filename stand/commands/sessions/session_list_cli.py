@@ -21,7 +21,7 @@ from recording.format.inventory import inventory
 from recording.reading.catalogue import Entry, Report, catalogue, look_at
 from recording.reading.notes import add_note, add_tags, check_tag, read_notes
 from stand.commands.sessions.session_args import SessionArgument, check_folder, check_session
-from stand.commands.sessions.session_table import ON_THE_RIGHT, entry_json, lines, rows
+from stand.commands.sessions.session_table import ON_THE_RIGHT, entry_json, fitting, lines, rows
 
 app = App(no_args_is_help=True)
 _USUAL = {"run": ("complete", "running"), "files": ("sound",)}  # anything else is shown in another colour
@@ -74,16 +74,20 @@ def _show_table(seen: list[Entry]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    columns, cells = rows(seen)
+    console = Console()
+    columns, cells, left_out = fitting(*rows(seen), console.width)
     table = Table(box=None, pad_edge=False)
     for column in columns:
-        table.add_column(column, justify="right" if column in ON_THE_RIGHT else "left")
+        is_name = column == columns[0]
+        table.add_column(column, justify="right" if column in ON_THE_RIGHT else "left", overflow="fold", no_wrap=is_name)
     for row in cells:
         named = zip(columns, row, strict=True)
         table.add_row(
             *(Text(cell, style="yellow" if cell not in _USUAL.get(name, (cell,)) else "") for name, cell in named)
         )
-    Console().print(table)
+    console.print(table)
+    if left_out:
+        say(f"the terminal is too narrow for: {', '.join(left_out)}; --json has them")
 
 
 @app.command()

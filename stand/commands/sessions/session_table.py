@@ -12,6 +12,9 @@ from recording.reading.catalogue import Entry
 COLUMNS = ("session", "recipe", "start (local)", "duration", "frames", "size", "devices", "run", "files")
 ON_THE_RIGHT = frozenset({"duration", "frames", "size"})
 _NOTE_WIDTH = 40
+_GAP = 2  # between columns
+_LEFT_OUT = ("note", "archived", "devices", "size", "tags", "recipe", "duration", "frames", "start (local)")
+"""What a narrow terminal does without, the first one first: which session it is and how it stands is shown in any."""
 
 
 def size(size_bytes: int) -> str:
@@ -55,6 +58,21 @@ def _last_note(entry: Entry) -> str:
         return ""
     text = one_line(entry.notes[-1].text)
     return text if len(text) <= _NOTE_WIDTH else f"{text[: _NOTE_WIDTH - 3]}..."
+
+
+def fitting(
+    columns: tuple[str, ...], table: Sequence[tuple[str, ...]], width: int
+) -> tuple[tuple[str, ...], list[tuple[str, ...]], tuple[str, ...]]:
+    """The columns that fit into so many characters, the table with these alone, and the columns that are left out."""
+    widths = {name: max(len(name), *(len(row[at]) for row in table)) for at, name in enumerate(columns)}
+    left_out: list[str] = []
+    for name in _LEFT_OUT:
+        if sum(widths.values()) + _GAP * (len(widths) - 1) <= width:
+            break
+        if widths.pop(name, None) is not None:
+            left_out.append(name)
+    kept = [at for at, name in enumerate(columns) if name in widths]
+    return tuple(columns[at] for at in kept), [tuple(row[at] for at in kept) for row in table], tuple(left_out)
 
 
 def lines(columns: tuple[str, ...], table: Sequence[tuple[str, ...]]) -> Iterator[str]:

@@ -37,6 +37,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from experiments.steps import Step as PlanStep
 from experiments.steps import kind_of, parameters_of
+from foundation.document_faults import path_text
 from foundation.errors import SessionError
 from recording.reading.journal_lines import JOURNAL_NAME, journal_line
 
@@ -244,7 +245,7 @@ def decoded(text: bytes) -> Written:
         values = cast("dict[str, object]", json.loads(text))
         return _adapter(cast("str", values.pop("entry"))).validate_python(values)
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
+        wrong = "; ".join(f"{path_text(fault['loc'])}: {fault['msg']}" for fault in error.errors())
         if any(fault["type"] in ("missing", "unexpected_keyword_argument") for fault in error.errors()):
             raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({wrong})") from error
         raise SessionError(f"{JOURNAL_NAME}: no run has written such entries ({wrong}); begin a new run") from error

@@ -86,9 +86,8 @@ class Journal:
         except OSError as error:
             if not directory.exists():
                 raise NotThere(f"{directory}: no such folder") from error
-            if not (directory / TELEMETRY).exists():
-                raise NotThere(f"{directory}: not a session, so there is nothing to resume") from error
-            raise SessionError(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
+            kind = SessionError if (directory / TELEMETRY).exists() else NotThere
+            raise kind(f"{directory}: has no journal of a run ({error.strerror}); begin a new run") from error
         try:
             if not path.is_file():  # a pipe of that name might never give a byte
                 raise SessionError(f"{path}: is no file, so no journal; begin a new run")

@@ -10,6 +10,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 
+from foundation.document_faults import path_text
 from foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
 from stand.serving.api.access import Access, App, Gatekeeper
 from stand.serving.api.bridge import Bridge, NoAnswer
@@ -112,7 +113,7 @@ def _invalid(_: Request, error: Exception) -> Response:
         if fault["type"] == "json_invalid":
             sentences.append(f"the body: is no JSON from character {int(fault['loc'][-1]) + 1} on")
             continue
-        where = ".".join(str(part) for part in fault["loc"] if part not in ("body", "query", "path", "header"))
+        where = path_text(part for part in fault["loc"] if part not in ("body", "query", "path", "header"))
         sentences.append(f"{where or 'the body'}: {_SENTENCES.get(fault['type'], fault['msg'])}")
     return _error(422, "; ".join(sentences) or "the request is not understood")
 
