@@ -1,6 +1,7 @@
 """What all tests share: the stock camera, and how they are dealt out to the workers."""
 
 import gc
+import itertools
 import multiprocessing
 import os
 import signal
@@ -28,6 +29,7 @@ settings.load_profile("day")
 _STOCK_CAMERA = {"tests/drivers/test_camera.py", "tests/system/test_stock_camera.py"}
 # In tests/system, whose long runs have each a laboratory of its own, the tests are dealt out one by one but for those
 # of a file that makes something once for all of them, or whose devices have the same serial numbers.
+_states = itertools.count()
 _DEALT_OUT = PurePath("tests/system")
 # A worker that took these last would be the only one at work for a minute.
 _LONG_FILES = {
@@ -72,6 +74,13 @@ def runtime_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         parent = tmp_path_factory.mktemp("runtime")
         patch.setenv("XDG_RUNTIME_DIR", str(parent))
         yield parent / "thermostand"
+
+
+@pytest.fixture(autouse=True)
+def _own_state(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What one test leaves latched of a stand is no business of the next one, which may have its address."""
+    base = request.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
+    monkeypatch.setenv("XDG_STATE_HOME", str(base / f"state-{os.getpid()}-{next(_states)}"))
 
 
 @pytest.fixture(scope="session", autouse=True)

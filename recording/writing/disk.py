@@ -20,7 +20,8 @@ LEFT_NAME = "stand-disk-left"  # of a process whose daemon has gone
 FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE = "frames", "telemetry", "journal", "files"
 QUEUE_LINE = "queue"  # which another program may have locked
 NOTES_LINE, REPAIR_LINE = "notes", "repair"  # a repair may take minutes
-_LINES = (FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE, QUEUE_LINE, NOTES_LINE, REPAIR_LINE)
+LATCH_LINE = "latch"  # which waits for nothing else
+_LINES = (FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE, QUEUE_LINE, NOTES_LINE, REPAIR_LINE, LATCH_LINE)
 
 
 class Disk(Helper):

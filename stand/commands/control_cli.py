@@ -15,11 +15,11 @@ from typing import Annotated, cast
 import typer
 
 from foundation.command_app import App
-from foundation.errors import ConfigError
+from foundation.errors import ConfigError, SessionError
 from foundation.instants import duration, local_text
 from foundation.output import output, show
 from foundation.usage import one_line
-from stand.commands.reached import on_stand
+from stand.commands.reached import ConfigOption, DirectoryArgument, TokenOption, UrlOption, on_stand, reached
 from stand.commands.sessions.session_text import size
 from stand.gate import INTERLOCK, STOPPING
 from stand.serving.client import API, Answer, Server
@@ -112,12 +112,24 @@ def continue_(server: Server) -> None:
 
 
 @app.command()
-@on_stand()
-def clear(server: Server) -> None:
-    """Continue a run that an interlock holds, once you have removed the cause.
+def clear(
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    url: UrlOption = "",
+    token_file: TokenOption = None,
+) -> None:
+    """Continue a run that an interlock holds, or free a stand that has tripped, once you have removed the cause.
+
+    Without a daemon: what an earlier run or daemon has left latched of the stand of --config.
 
     Example: stand clear
     """
+    try:
+        server = reached(directory, config, url, token_file)
+    except SessionError:
+        if url or directory is not None or not _cleared_here(config):
+            raise
+        return
     answer = server.order("clear")
     _say(server, answer, f"cleared; {_still(answer) if answer.get('reasons') else 'nothing holds the stand any more'}")
 
@@ -160,6 +172,27 @@ def stop(server: Server) -> None:
     """
     answer = server.order("stop")
     _say(server, answer, str(answer["text"]))
+
+
+def _cleared_here(config: str) -> bool:
+    """Whether the stand, which no program has, was latched, and is so no longer; InUse when one has it."""
+    import asyncio
+
+    from stand.config.stand_config import load_config, packaged
+    from stand.running.opening.claim import claimed
+    from stand.running.opening.stand_latch import StandLatch
+
+    async def cleared() -> bool:
+        stand = load_config(packaged("", config))
+        async with claimed(stand, None, "stand clear"):
+            latch = await asyncio.to_thread(StandLatch.of, stand)
+            fault = await asyncio.to_thread(latch.read)
+            if fault is not None:
+                await asyncio.to_thread(latch.clear)
+                show(fault.model_dump(), [f"cleared: {one_line(fault.text)}"])
+            return fault is not None
+
+    return asyncio.run(cleared())
 
 
 def _say(server: Server, answer: Mapping[str, object], text: str) -> None:

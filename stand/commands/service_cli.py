@@ -17,6 +17,7 @@ from foundation.files import write_whole
 from foundation.output import say, show
 from stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
 from stand.config.stand_config import StandConfig, load_config, packaged
+from stand.running.opening.stand_latch import SYSTEM_FOLDER
 from stand.serving.presence import STANDS_FOLDER
 
 app = App()
@@ -140,6 +141,8 @@ def folders(group: str) -> str:
     """Where the locks of this machine's stands lie (presence.lock_folder)."""
     return f"""# The locks of stands: only their operators may take one
 d {STANDS_FOLDER} 2770 root {group} -
+# What has tripped, and nobody has cleared
+d {SYSTEM_FOLDER} 2770 root {group} -
 """
 
 

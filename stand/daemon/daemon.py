@@ -24,7 +24,7 @@ from recording.writing.recorder import FINISH_WITHIN_S
 from stand.daemon import systemd
 from stand.daemon.by_hand import ByHand
 from stand.daemon.counters import Counters
-from stand.daemon.daemon_file import Kept, KeptFile, Latch
+from stand.daemon.daemon_file import Kept, KeptFile
 from stand.daemon.day_record import DayRecord
 from stand.daemon.orders import Orders
 from stand.fault import Fault
@@ -33,6 +33,7 @@ from stand.queueing.queue_file import Entry
 from stand.queueing.queue_work import Notes, drain
 from stand.running.guest import Guest
 from stand.running.opening.open_stand import OpenStand
+from stand.running.opening.stand_latch import LatchedFault
 from stand.running.opening.stop import STOPPED, catch_signals
 from stand.running.opening.writer_restarts import WriterRestarts
 from stand.serving.alert_book import RUN_FAILED
@@ -52,7 +53,15 @@ _ENDED_AGAIN_S = 5.0  # between two records that end by themselves
 class Daemon:
     """An open stand with its queue and record. `serve` until it is asked to leave, or something fails."""
 
-    def __init__(self, open_stand: OpenStand, orders: Orders, record: DayRecord, kept: Kept, keep: KeptFile) -> None:
+    def __init__(
+        self,
+        open_stand: OpenStand,
+        orders: Orders,
+        record: DayRecord,
+        kept: Kept,
+        keep: KeptFile,
+        latched: LatchedFault | None = None,
+    ) -> None:
         assembly = open_stand.assembly
         self.open_stand = open_stand
         self.orders = orders
@@ -65,7 +74,8 @@ class Daemon:
         self._assembly = assembly
         self._hub = hub
         self._clock = assembly.clock
-        self._kept, self._keep = kept, keep
+        self._keep = keep
+        self._latched = latched  # by a program before this one
         self._status = systemd.Status()
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
         self._is_given_up = False  # an operator does not want to wait for the confirmation that the stand is safe
@@ -73,8 +83,8 @@ class Daemon:
         self._others: set[asyncio.Task[None]] = set()
         self._extending: list[asyncio.Task[None]] = []
         self._restarts, self._run_id = WriterRestarts(), 0  # after which run that had the stand last
-        self._recorded_ns = self._turned_ns = 0  # when a record was last begun, or that of a new day, or could not be
         hub.subscribe(self._follow)
+        self._recorded_ns = self._turned_ns = 0  # when a record was last begun, or that of a new day, or could not be
 
     @property
     def guest(self) -> Guest | None:
@@ -112,10 +122,8 @@ class Daemon:
             self._is_given_up = self._assembly.stand.safety.give_up()
 
     def note(self) -> None:
-        """Counters and fault are kept for the next start."""
-        fault = self.open_stand.latched
-        latch = None if fault is None else Latch(rule=fault.rule, text=fault.text, since_ns=self.open_stand.fault_ns)
-        self._keep.note(Kept(counters=dict(self.counters.values), latch=latch))
+        """Counters are kept for the next start."""
+        self._keep.note(Kept(counters=dict(self.counters.values)))
 
     def clear_queue(self) -> None:
         """What halted it has been looked into."""
@@ -169,8 +177,7 @@ class Daemon:
             self.open_stand.prepare()
             await self.open_stand.read_once()
             self.open_stand.start()
-            if self._kept.latch is not None:
-                latch = self._kept.latch
+            if (latch := self._latched) is not None:
                 self.open_stand.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
             self.open_stand.guard.look()
             catch_signals(self.leave)
@@ -410,8 +417,8 @@ class Daemon:
         return task
 
     def _follow(self, item: Item) -> None:
-        """The hub's subscriber: what has tripped is kept at once."""
-        if isinstance(item, Event) and (item.kind.startswith("guard.") or item.kind in ("command", "hold_ended")):
+        """The hub's subscriber: what has led to a trip is counted when the daemon is killed after it."""
+        if isinstance(item, Event) and item.kind.startswith("guard."):
             self.note()
 
     def _say(self, line: str) -> None:

@@ -1,10 +1,13 @@
-"""What a daemon knows across restarts, beside its sessions: `daemon.json` with the counters and a fault nobody has
-cleared. Written in the background, by the process that touches the disk: no loop waits for it."""
+"""What a daemon knows across restarts, beside its sessions: `daemon.json` with the counters.
+
+Written in the background, by the process that touches the disk: no loop waits for it.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -20,31 +23,28 @@ NAME = "daemon.json"
 _CLOSE_LIMIT_S = 1.0
 
 
-class Latch(BaseModel):
-    """A fault that nobody has cleared."""
-
-    model_config = ConfigDict(frozen=True)
-
-    rule: str
-    text: str
-    since_ns: int
-
-
 class Kept(BaseModel):
     """The file. counters: by name, see counters.py."""
 
     model_config = ConfigDict(frozen=True)
 
     counters: dict[str, float] = Field(default_factory=dict)
-    latch: Latch | None = None
 
 
-def kept_in(directory: Path) -> Kept:
-    """What a daemon before has left; nothing when there is none, or when it cannot be read. Blocking."""
+def kept_in(directory: Path) -> tuple[Kept, str]:
+    """What a daemon before has left, and what is wrong with it, as a sentence: a damaged file is kept beside it, and
+    the counters begin again. Blocking."""
+    path = directory / NAME
     try:
-        return Kept.model_validate_json((directory / NAME).read_bytes())
-    except (OSError, ValidationError):
-        return Kept()
+        return Kept.model_validate_json(path.read_bytes()), ""
+    except FileNotFoundError:
+        return Kept(), ""
+    except (OSError, ValidationError) as error:
+        aside = path.with_name(f"{NAME}.damaged")
+        with suppress(OSError):
+            path.replace(aside)
+        why = error.strerror if isinstance(error, OSError) else "it is damaged"
+        return Kept(), f"{path}: cannot be read ({why}), and is {aside.name} now; the counters begin again at 0"
 
 
 class KeptFile:
@@ -81,5 +81,5 @@ class KeptFile:
             try:
                 await self._lane.call(self._run, replace_file, self._path, kept.model_dump_json(indent=1).encode())
             except (OSError, TimeoutError) as error:
-                text = f"counters and faults are not kept for the next start: {error}"
+                text = f"counters are not kept for the next start: {error}"
                 self._hub.publish(Event(self._clock.now_ns(), "warning", "daemon_not_kept", text))

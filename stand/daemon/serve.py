@@ -27,6 +27,7 @@ from stand.message_limit import stand_hub
 from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
 from stand.running.opening.open_stand import opened
+from stand.running.opening.stand_latch import StandLatch
 from stand.running.opening.stop import Stop
 from stand.serving.alerts import alerting
 
@@ -52,7 +53,8 @@ async def serve(
     async with Stop() as stop, claimed(config, None):
         hub, clock = stand_hub(), WallClock()
         await asyncio.to_thread(out.mkdir, parents=True, exist_ok=True)
-        kept = await asyncio.to_thread(kept_in, out)
+        kept, damage = await asyncio.to_thread(kept_in, out)
+        latched = await asyncio.to_thread(StandLatch.of(config).read)
         watch = ClockWatch(hub, clock)
         assembly = assemble(config, hub, clock)
         assembly.notifier.start()
@@ -74,7 +76,9 @@ async def serve(
                     hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
                 if accepted := config.accepted():
                     hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
-                daemon = Daemon(open_stand, orders, record, kept, keep)
+                if damage:
+                    hub.publish(Event(clock.now_ns(), "warning", "daemon_file_damaged", damage))
+                daemon = Daemon(open_stand, orders, record, kept, keep, latched)
                 await daemon.serve(lambda hub, clock: front(DaemonDesk(daemon), hub, clock))
             if unsafe := assembly.stand.safety.unconfirmed:
                 raise StandTripped(f"the daemon ends, but NOT SAFE: {'; '.join(unsafe)}")

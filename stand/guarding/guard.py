@@ -37,6 +37,9 @@ class Guard:
 
     met: device errors that steps have met, whose watches are among `watches`.
 
+    latch: gets each fault that only an operator ends before anything else is done or said of it; it waits for a disk
+    for a quarter of a second at most.
+
     A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
     wait for a GOOD reading of each of `vital`, the channels that heat depends on, taken since. What is too old
     only because of it is given time to be renewed (Watch.after_gap_s).
@@ -55,6 +58,7 @@ class Guard:
     met: MetErrors = field(default_factory=lambda: MetErrors({}))
     vital: tuple[str, ...] = ()
     keeps_on: bool = False
+    latch: Callable[[Fault], None] = lambda _: None
     held: Fault | None = None  # why the run waits
     _ended: bool = False
     _looked_ns: int | None = None
@@ -145,6 +149,7 @@ class Guard:
             await asyncio.wait(self._telling)
 
     def _abort(self, fault: Fault) -> None:
+        self.latch(fault)
         self._ended = not self.keeps_on
         self.held = fault if self.keeps_on else self.held
         try:
@@ -166,6 +171,8 @@ class Guard:
     def _begin_hold(self, fault: Fault) -> None:
         if self.hold is None:
             return
+        if not fault.ends_itself:
+            self.latch(fault)
         self.held = fault
         self.hold(fault)
         self._make_safe(fault)
@@ -180,6 +187,7 @@ class Guard:
                 "`stand clear` continues"
             )
             self.held = Fault(fault.rule, text, fault.action)
+            self.latch(self.held)
             self.hub.publish(Event(now_ns, "error", "hold_stays", text, data))
             self._notify(text)
             return

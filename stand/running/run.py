@@ -12,6 +12,7 @@ from pathlib import Path
 from foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
 from foundation.errors import Interrupted, SessionError, StandError, StandTripped
 from foundation.hub import Hub
+from foundation.instants import utc_text
 from foundation.items import Event, Item
 from foundation.progress import late_progress
 from foundation.tasks import cancelled, cause_of, failure_text
@@ -27,6 +28,7 @@ from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
 from stand.running.opening.one_cpu import one_cpu
 from stand.running.opening.open_stand import OpenStand, Time, opened
+from stand.running.opening.stand_latch import StandLatch
 from stand.running.opening.stop import Stop
 from stand.running.opening.temperature_check import check_temperature
 from stand.running.opening.writer_restarts import WriterRestarts
@@ -112,6 +114,7 @@ async def _kept_on(job: Job, clock: WallClock) -> Path:
         finally:
             if job.before is not None:
                 job.before.release()
+        await asyncio.to_thread(StandLatch.of(job.order.config).clear)
         before = await asyncio.to_thread(partial(interruption, directory, job.order.config, clear=True))
         order = replace(before.order, attended=job.order.attended)
         before = replace(before, order=order)
@@ -174,6 +177,8 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
     """The whole run; one on a real stand has it for itself from before anything is opened, or does not touch it."""
     directory = _directory(job, clock)
     async with claimed(job.order.config, directory) if isinstance(clock, WallClock) else nullcontext():
+        if isinstance(clock, WallClock):
+            await asyncio.to_thread(_check_latch, job)
         hub, early = stand_hub(), _Early()
         job.watch(hub)
         hub.subscribe(early)
@@ -191,6 +196,17 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
         finally:
             assembly.notifier.close()
     return directory
+
+
+def _check_latch(job: Job) -> None:
+    """StandTripped when the stand has tripped and nobody has cleared it; a run that is resumed after its trip was
+    cleared clears it."""
+    latch = StandLatch.of(job.order.config)
+    if job.before is not None and job.before.state.tripped:
+        latch.clear()
+    elif (fault := latch.read()) is not None:
+        since = f" at {utc_text(fault.since_ns)}" if fault.since_ns else ""
+        raise StandTripped(f"the stand has tripped{since}: {fault.text}; remove the cause, then `stand clear`")
 
 
 def _directory(job: Job, clock: Clock) -> Path:

@@ -14,7 +14,7 @@ from foundation.patience import Patience
 from foundation.readings import Reading, bad_reading
 from stand.daemon import systemd
 from stand.daemon.counters import Counters
-from stand.daemon.daemon_file import Kept, KeptFile, Latch, kept_in
+from stand.daemon.daemon_file import Kept, KeptFile, kept_in
 from stand.daemon.reports import Reports
 
 
@@ -54,16 +54,18 @@ def test_what_was_not_read_is_not_counted():
     assert counters.values["compressor_starts"] == 0
 
 
-async def test_counters_and_a_fault_are_there_for_the_next_daemon(tmp_path: Path):
+async def test_counters_are_there_for_the_next_daemon(tmp_path: Path):
     kept = KeptFile(tmp_path, lambda function, *arguments: function(*arguments), Hub(), WallClock())
-    last = Kept(counters={"flap_cycles": 3.0}, latch=Latch(rule="folder_lost", text="it is gone", since_ns=5))
+    last = Kept(counters={"flap_cycles": 3.0})
     kept.note(Kept(counters={"flap_cycles": 1.0}))
     kept.note(last)
     await kept.close(Patience())
-    assert kept_in(tmp_path) == last
+    assert kept_in(tmp_path) == (last, "")
     (tmp_path / "daemon.json").write_text("{")
-    assert kept_in(tmp_path) == Kept()  # a damaged file is no reason not to open a stand
-    assert kept_in(tmp_path / "nowhere") == Kept()
+    found, damage = kept_in(tmp_path)  # a damaged file is no reason not to open a stand
+    assert (found, "the counters begin again at 0" in damage) == (Kept(), True)
+    assert (tmp_path / "daemon.json.damaged").read_text() == "{"
+    assert kept_in(tmp_path / "nowhere") == (Kept(), "")
 
 
 async def test_a_disk_that_refuses_is_an_event(tmp_path: Path):

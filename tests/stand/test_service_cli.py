@@ -10,6 +10,7 @@ from typer.testing import CliRunner, Result
 
 from stand.commands.command_table import app
 from stand.config.stand_config import packaged
+from stand.running.opening.stand_latch import SYSTEM_FOLDER
 from stand.serving.presence import STANDS_FOLDER
 
 CONFIG = packaged("", "simulated")
@@ -48,7 +49,7 @@ def test_the_unit_may_do_little_and_systemd_reads_it(tmp_path: Path):
     wanted = {"NoNewPrivileges=yes", "ProtectSystem=full", "PrivateTmp=yes", "CapabilityBoundingSet="}
     assert wanted <= set(path.read_text().splitlines())
     folders = (tmp_path / "etc/tmpfiles.d/thermostand.conf").read_text().splitlines()
-    assert folders[-1] == f"d {STANDS_FOLDER} 2770 root optics -"
+    assert {f"d {folder} 2770 root optics -" for folder in (STANDS_FOLDER, SYSTEM_FOLDER)} <= set(folders)
     if systemd := shutil.which("systemd-analyze"):
         checked = subprocess.run([systemd, "verify", str(path)], capture_output=True, text=True, check=False)
         assert [line for line in checked.stderr.splitlines() if path.name in line] == []

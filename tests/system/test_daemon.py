@@ -27,6 +27,7 @@ from stand.running.guest import Guest
 from stand.serving.client import Server, server_of
 from stand.serving.desk import Conflict, RunRequest, StandState, Who
 from tests import forked
+from tests.nightly import by_night
 from tests.system.test_real_time import BRIEF as CYCLE
 from tests.system.test_two_runs import Laboratory
 
@@ -229,7 +230,9 @@ def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
     assert "run.resume" in kinds
 
 
-def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(serve: Callable[[], Served]):
+def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(
+    serve: Callable[[], Served], laboratory: Path, tmp_path: Path
+):
     served = serve()
     served.until(is_idle)
     (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
@@ -246,6 +249,17 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(serve
     assert states_of(served.state()) == ["waiting"]
     served.process.send_signal(signal.SIGKILL)
     served.process.wait()
+    elsewhere = Served(laboratory, tmp_path / "other")
+    try:
+        assert (found := elsewhere.until(is_idle).fault) is not None
+        assert found.rule == tripped.fault.rule
+    finally:
+        elsewhere.process.send_signal(signal.SIGKILL)
+        elsewhere.process.communicate()
+    run = [sys.executable, "-m", "stand.cli", "run", "warm-up", "--config", str(laboratory), "--out", str(tmp_path)]
+    refused = forked.popen(run, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert "the stand has tripped" in refused.communicate()[0]
+    assert refused.returncode == 1
     again = serve()
     latched = again.until(is_idle)
     assert latched.fault is not None
@@ -253,6 +267,25 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(serve
     assert latched.fault.rule == tripped.fault.rule
     again.post("run/clear")
     again.until(lambda state: state.fault is None and states_of(state) == ["done"])
+
+
+@pytest.mark.parametrize("kills", [2, by_night(20)])
+def test_a_trip_that_somebody_has_heard_of_is_never_forgotten(laboratory: Path, tmp_path: Path, kills: int):
+    """Killed as soon as the stand's state says it; what is left is cleared without a daemon."""
+    for kill in range(kills):
+        served = Served(laboratory, tmp_path / f"out-{kill}")
+        try:
+            served.until(is_idle)
+            (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
+            folder.rename(folder.with_name("elsewhere"))
+            served.until(lambda state: state.fault is not None)
+        finally:
+            served.process.send_signal(signal.SIGKILL)
+            served.process.communicate()
+        clear = [sys.executable, "-m", "stand.cli", "clear", "--config", str(laboratory)]
+        cleared = forked.popen(clear, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        assert "cleared: the folder" in cleared.communicate()[0]
+        assert cleared.returncode == 0
 
 
 def test_a_second_daemon_and_a_second_run_touch_nothing(serve: Callable[[], Served], laboratory: Path, tmp_path: Path):

@@ -149,7 +149,7 @@ def _lock_among_users(folder: Path, device: str, content: Mapping[str, object]) 
 @contextmanager
 def _lock_file(folder: Path, mode: int, device: str, content: Mapping[str, object]) -> Generator[None]:
     place = str(content["place"])
-    path = folder / _file_name(place)
+    path = folder / file_name(place)
     try:
         file = take(path, json.dumps(content).encode(), mode)
     except OSError as error:
@@ -164,13 +164,13 @@ def _lock_file(folder: Path, mode: int, device: str, content: Mapping[str, objec
 
 def _in_use(device: str, place: str) -> InUse:
     named = place.partition(" in net:")[0]  # people do not know a network namespace by its number
-    return InUse(device, f"{named} is in use by {_holder(_file_name(place))}; nothing was touched")
+    return InUse(device, f"{named} is in use by {_holder(file_name(place))}; nothing was touched")
 
 
-def _file_name(place: str) -> str:
+def file_name(place: str, suffix: str = ".lock") -> str:
     """To be read by people, and one of its own for each place."""
     digest = hashlib.sha256(place.encode()).hexdigest()[:8]
-    return f"{re.sub(r'[^A-Za-z0-9._]+', '-', place)[:80]}-{digest}.lock"
+    return f"{re.sub(r'[^A-Za-z0-9._]+', '-', place)[:80]}-{digest}{suffix}"
 
 
 def _holder(file_name: str) -> str:
@@ -189,7 +189,7 @@ def daemon_pid(config: StandConfig) -> int | None:
     for address in addresses(config):
         for folder in (*runtime_folders(), STANDS_FOLDER):
             with suppress(OSError, ValueError, LookupError, TypeError):
-                said = _said(folder / _file_name(address.place))
+                said = _said(folder / file_name(address.place))
                 if not said["session"] and not said.get("command"):
                     return int(str(said["pid"]))
     return None

@@ -13,9 +13,10 @@ from typing import Protocol, TypeVar
 
 from foundation.clock import VirtualClock, WallClock
 from foundation.errors import DeviceFault, StandError, Unreachable
+from foundation.items import Event
 from foundation.patience import Patience
 from foundation.tasks import cancelled, watched
-from recording.writing.disk import FILES_LINE, Disk
+from recording.writing.disk import FILES_LINE, LATCH_LINE, Disk
 from stand.assembly import Assembly, assemble
 from stand.config.stand_config import StandConfig
 from stand.fault import Fault
@@ -27,6 +28,7 @@ from stand.message_limit import stand_hub
 from stand.poller import Poller
 from stand.running.opening.claim import claimed
 from stand.running.opening.holds import keep_shut_in_holds
+from stand.running.opening.stand_latch import StandLatch
 from stand.running.opening.stop import Stop
 
 _OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
@@ -78,6 +80,7 @@ class OpenStand:
         self.recorder: Recorder | None = None
         self.guest: Guest | None = None
         self.fault_ns = 0  # when the last fault was found
+        self.kept: StandLatch | None = None  # what outlives this process; None in virtual time
         self._announced = Announcements()
         self._guard: Guard | None = None
         self._pollers: tuple[Poller, ...] = ()
@@ -119,6 +122,7 @@ class OpenStand:
             self._announced,
         )
         self._guard.keeps_on = not self.is_for_one
+        self._guard.latch = self._keep
 
     async def read_once(self) -> None:
         """Every device is read and published now; DeviceError the first time, when one cannot be read."""
@@ -210,6 +214,15 @@ class OpenStand:
         self.guard.held, self.fault_ns = fault, since_ns
         self.assembly.stand.gate.hold(INTERLOCK)
 
+    def _keep(self, fault: Fault) -> None:
+        """On the disk, before anything is said of it."""
+        if self.kept is not None and (failure := self.kept.keep(fault, self.assembly.clock.now_ns())):
+            text = f"that the stand has tripped may be forgotten at a restart: {failure}"
+            self._tell("error", "latch_not_kept", text)
+
+    def _tell(self, level: str, kind: str, text: str) -> None:
+        self.assembly.hub.publish(Event(self.assembly.clock.now_ns(), level, kind, text))
+
     def _trip(self, fault: Fault) -> None:
         self.fault_ns = self.assembly.clock.now_ns()
         if self.guest is None:
@@ -234,6 +247,8 @@ class OpenStand:
             self.assembly.stand.safety.forgive()
             if self.recorder is not None:
                 self.recorder.refound()
+            if self.kept is not None and (failure := self.kept.forget()):
+                self._tell("warning", "latch_not_cleared", f"at a restart the stand is taken for tripped: {failure}")
             self.guard.clear()
 
 
@@ -265,11 +280,15 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
     """
     async with AsyncExitStack() as stack:
         disk = None if isinstance(assembly.clock, VirtualClock) else Disk()
+        latch = None
         if disk is not None:
+            latch = await asyncio.to_thread(StandLatch.of, assembly.config)
             stack.push_async_callback(disk.ended_within, stop.patience)
             assembly.stand.chamber.compressor_file.through(disk.line(FILES_LINE).run)
+            latch.run = disk.line(LATCH_LINE).run
         stack.push_async_callback(assembly.stand.chamber.compressor_file.close, stop.patience)
         open_stand = OpenStand(assembly, disk, stop.patience, is_for_one=is_for_one)
+        open_stand.kept = latch
         stack.push_async_callback(cancelled, open_stand.background)
         if time is not None:
             open_stand.background.append(asyncio.create_task(time()))

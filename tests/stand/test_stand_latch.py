@@ -1,0 +1,117 @@
+"""A stand's latch: on the disk before anything is said, found again, and not taken for none when it is unreadable."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from foundation.documents import parse_document
+from foundation.errors import SessionError
+from stand.config.stand_config import StandConfig, packaged
+from stand.fault import Fault
+from stand.running.opening.stand_latch import UNREADABLE, WITHIN_S, StandLatch, state_folder
+
+FAULT = Fault("over_temperature", "thermometers.air is 61.00 degC")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "state" / "bus.latched.json"
+
+
+def test_what_was_kept_is_found_by_another_program_until_it_is_cleared(path: Path):
+    assert StandLatch([path]).read() is None
+    assert StandLatch([path]).keep(FAULT, 5) == ""
+    found = StandLatch([path]).read()
+    assert found is not None
+    assert (found.rule, found.text, found.since_ns) == (FAULT.rule, FAULT.text, 5)
+    assert StandLatch([path]).forget() == ""
+    assert StandLatch([path]).read() is None
+    StandLatch([path]).clear()
+
+
+def whole(path: Path) -> bytes:
+    StandLatch([path]).keep(FAULT, 5)
+    return path.read_bytes()
+
+
+def halved(path: Path) -> None:
+    path.write_bytes(whole(path)[:20])
+
+
+def zeroed(path: Path) -> None:
+    path.write_bytes(bytes(len(whole(path))))
+
+
+def nulled(path: Path) -> None:
+    path.write_text('{"rule": null, "text": "x", "since_ns": 5}')
+
+
+def emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def linked(path: Path) -> None:
+    path.symlink_to(path.with_name("nowhere"))
+
+
+def made_a_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def of_another_shape(path: Path) -> None:
+    path.write_text("[]")
+
+
+@pytest.mark.parametrize("spoil", [halved, zeroed, nulled, emptied, linked, made_a_folder, of_another_shape])
+def test_one_that_cannot_be_read_counts_as_latched_and_can_be_cleared(path: Path, spoil: Callable[[Path], None]):
+    path.parent.mkdir()
+    spoil(path)
+    found = StandLatch([path]).read()
+    assert found is not None
+    assert found.rule == UNREADABLE
+    assert str(path) in found.text
+    StandLatch([path]).clear()
+    assert StandLatch([path]).read() is None
+
+
+def test_one_that_cannot_be_cleared_stays_and_is_named(path: Path):
+    path.mkdir(parents=True)
+    (path / "something").touch()
+    with pytest.raises(SessionError, match="the stand stays latched"):
+        StandLatch([path]).clear()
+
+
+def test_a_disk_that_hangs_keeps_the_guard_waiting_for_a_moment_only(path: Path):
+    latch, hanging = StandLatch([path]), threading.Event()
+    latch.run = lambda *_: hanging.wait()
+    assert WITHIN_S <= 0.25
+    assert latch.keep(FAULT, 5) == "the disk has not answered"
+    hanging.set()
+
+
+def test_a_process_that_has_ended_is_done_without(path: Path):
+    latch = StandLatch([path])
+
+    def ended(*_: object) -> object:
+        raise BrokenPipeError(32, "the process that writes the session to the disk has ended")
+
+    latch.run = ended
+    assert latch.keep(FAULT, 5) == ""
+    assert StandLatch([path]).read() is not None
+
+
+def test_it_belongs_to_what_heats_and_not_to_a_name_or_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+
+    def of(**changes: object) -> StandLatch:
+        return StandLatch.of(parse_document(yaml.safe_dump(data | changes), StandConfig, "stand.yaml"))
+
+    assert of().keep(FAULT, 5) == ""
+    assert of(name="another", recording={"directory": "/elsewhere"}).read() is not None
+    assert of(axes={}, cameras={}).read() is not None
+    assert of(bus=data["bus"] | {"address": "tcp:127.0.0.1:5999"}).read() is None
+    assert state_folder() == tmp_path / "thermostand"
