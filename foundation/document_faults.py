@@ -6,6 +6,7 @@ import difflib
 import re
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from typing import Annotated, Any, Union, cast, get_args, get_origin
 
 import yaml
@@ -225,7 +226,7 @@ def path_text(place: Iterable[int | str]) -> str:
     """A place as people read it: entries are counted from 1, as steps are everywhere. Of a key that is a number
     pydantic says so behind it."""
     parts = tuple(place)
-    numbered = zip(parts, (*parts[1:], ""), strict=True)
+    numbered = zip_longest(parts, parts[1:])
     return ".".join(
         str(part + 1 if isinstance(part, int) and behind != _KEY else part) for part, behind in numbered if part != _KEY
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from foundation.document_faults import sentences, words_for_numbers, yaml_fault
+from foundation.document_faults import path_text, sentences, words_for_numbers, yaml_fault
 from foundation.errors import ConfigError, NotThere, SessionError
 from foundation.files import unreadable
 
@@ -106,8 +106,10 @@ def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
         raise kind(unreadable(path, error)) from error
     except ValidationError as error:
         fault = error.errors()[0]
-        where = ".".join(str(part) for part in fault["loc"]) or "the file"
-        raise SessionError(f"{path}: not {what} of this program ({where}: {fault['msg']})") from error
+        # What a file of another kind lacks is no news to a reader; what is wrong inside of one of this kind is.
+        where, kind_of_fault = path_text(fault["loc"]), fault["type"]
+        more = "" if kind_of_fault.startswith("union_tag") or not where else f" ({where}: {fault['msg']})"
+        raise SessionError(f"{path}: not {what} of this program{more}") from error
     except ValueError as error:
         raise SessionError(f"{path}: not {what} of this program ({error})") from error
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from foundation.documents import Document, load_document
+from foundation.documents import Document, load_document, read_document
 from foundation.errors import DetectionError
 from markers.april_grid import AprilGrid, find_tag_corners
 from markers.noise import Image, full_scale_DN
@@ -80,10 +80,9 @@ BoardOfCorners = CornerBoard | AprilGrid
 
 
 def load_corner_board(path: Path) -> BoardOfCorners | None:
-    """The board of a file that says of which `kind` it is; None for others, which are of dots."""
-    kinds = [
-        line.split(":", 1)[1] for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("kind:")
-    ]
+    """The board of a file that says of which `kind` it is; None for others, which are of dots. ConfigError when it
+    cannot be read."""
+    kinds = [line.split(":", 1)[1] for line in read_document(path).splitlines() if line.startswith("kind:")]
     if not kinds:
         return None
     return load_document(path, AprilGrid if "aprilgrid" in kinds[0] else CornerBoard)

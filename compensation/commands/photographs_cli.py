@@ -18,7 +18,7 @@ from compensation.calibration.view_uncertainty import in_words
 from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
 from compensation.commands.options import MegapixelsOption, installed_target, say_left_out
 from foundation.command_app import App
-from foundation.errors import CalibrationError
+from foundation.errors import CalibrationError, ConfigError
 from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.output import show
@@ -56,6 +56,11 @@ def calibrate_photographs(
     Example: compensate calibrate-photographs photos/*.jpg --target my-target.yaml --export exports
     """
     with images_up_to(max_megapixels):
+        for path in images:
+            if not path.is_file():
+                raise ConfigError(
+                    f"{path}: {'is a folder; give the pictures in it' if path.exists() else 'no such file'}"
+                )
         check_folder_writable(export, EXPORTS)
         board = described(target)
         failures: list[str] = []
@@ -139,7 +144,7 @@ def views_of(
             pixels = read_image(path)
             found, covariance, is_doubtful = _look(pixels, board)
         except DetectionError as error:
-            failures.append(f"{name}: {error}")
+            failures.append(f"{name}: {str(error).removeprefix(f'{path}: ')}")
             continue
         shape = (pixels.shape[1], pixels.shape[0])
         if size not in (None, shape):

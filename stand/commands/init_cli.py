@@ -154,7 +154,10 @@ def _check(texts: Mapping[str, str]) -> None:
     """ConfigError when what would be written could not be run."""
     with tempfile.TemporaryDirectory() as folder:
         _write(Path(folder), texts)
-        order = load_order(str(Path(folder) / "recipe.yaml"), str(Path(folder) / "stand.yaml"))
+        try:
+            order = load_order(str(Path(folder) / "recipe.yaml"), str(Path(folder) / "stand.yaml"))
+        except ConfigError as error:  # of a file that nobody will see
+            raise ConfigError(f"nothing is written: {str(error).replace(f'{folder}/', '')}") from error
         price_night(tuple(order.recipe.plan()), order.config, Path(folder))
 
 
@@ -163,7 +166,10 @@ def _write(directory: Path, texts: Mapping[str, str]) -> list[Path]:
     paths = {directory / name: text for name, text in texts.items()}
     if there := [path for path in paths if path.exists() or path.is_symlink()]:
         raise ConfigError(f"{there[0]}: is there already, and stays as it is; choose another folder")
-    directory.mkdir(parents=True, exist_ok=True)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{directory}: cannot be made ({error.strerror}); choose another folder") from error
     for path, text in paths.items():
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

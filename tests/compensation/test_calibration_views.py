@@ -128,6 +128,23 @@ def test_the_command_calibrates_photographs_and_says_how_well(tmp_path: Path):
     assert (result.exit_code, (tmp_path / "none").exists()) == (1, False)
 
 
+def test_pictures_and_targets_that_are_none_are_named(tmp_path: Path):
+    text, folder = tmp_path / "text.png", tmp_path / "folder"
+    text.write_bytes(b"\x89PNG")
+    folder.mkdir()
+    for images, target, status, says in (
+        ([text], "paper-9x6", 1, "text.png: not an image"),
+        ([text], str(text), 2, "text.png: cannot be read (line 1 is not UTF-8"),
+        ([text, tmp_path / "none.png"], "paper-9x6", 2, "none.png: no such file"),
+        ([folder], "paper-9x6", 2, "folder: is a folder"),
+    ):
+        arguments = ["calibrate-photographs", *map(str, images), "--target", target, "--export", str(tmp_path / "out")]
+        result = CliRunner().invoke(app, arguments)
+        assert (result.exit_code, says in result.stderr) == (status, True), result.output
+        assert result.stderr.count("text.png") <= 1
+    assert not (tmp_path / "out").exists()
+
+
 def test_pictures_of_two_sizes_are_refused(tmp_path: Path):
     scene = replace(HALF, distance_mm=1100)
     image = photograph(scene, render(scene), 1)

@@ -120,7 +120,7 @@ def test_the_shell_completes_commands_and_options(program: str, words: str, foun
         ("stand", "no-such-command --json", 2),
         ("compensate", "fit no-such-session -o x.json --json", 2),
         ("compensate", "apply --json", 2),
-        ("compensate", "calibrate-photographs no.png --target paper-9x6 --export . --json", 1),
+        ("compensate", "calibrate-photographs no.png --target paper-9x6 --export . --json", 2),
     ],
 )
 def test_an_error_is_json_where_that_was_asked_for(program: str, words: str, status: int, tmp_path, monkeypatch):

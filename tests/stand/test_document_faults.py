@@ -5,6 +5,7 @@ from time import process_time
 
 import pytest
 
+from foundation.document_faults import path_text
 from foundation.documents import parse_document
 from foundation.errors import ConfigError
 from stand.config.recipe import Recipe
@@ -182,3 +183,8 @@ def test_twenty_thousand_unknown_keys_are_refused_in_the_time_it_takes_to_read_t
     with pytest.raises(ConfigError, match=r"and \d{5} more"):
         parse_document(above + keys, StandConfig, "mine.yaml")
     assert process_time() - begun_s < 10.0  # 0.4 s, and 30 s when each key was looked for among all others
+
+
+def test_entries_are_counted_from_1_and_a_place_may_be_the_whole():
+    assert path_text(("steps", 0, "repeat", "steps", 3)) == "steps.1.repeat.steps.4"
+    assert (path_text(("thermometers", 5, "[key]")), path_text(())) == ("thermometers.5", "")

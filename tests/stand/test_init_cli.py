@@ -102,7 +102,18 @@ def test_nothing_that_is_there_is_overwritten(tmp_path: Path):
     assert (tmp_path / "recipe.yaml").read_text() == "mine"
 
 
-@pytest.mark.parametrize("options", [("--simulated", "--bus", "x"), ("--axis", "linear"), ("--axis", "up=/dev/x:1")])
+@pytest.mark.parametrize(
+    "options", [("--bus", "a b:c:d"), ("--simulated", "--bus", "x"), ("--axis", "linear"), ("--axis", "up=/dev/x:1")]
+)
 def test_options_that_mean_nothing_are_refused(tmp_path: Path, options: tuple[str, ...]):
     assert invoke(tmp_path / "new", "--no-ask", *options).exit_code == 2
     assert not (tmp_path / "new").exists()
+
+
+def test_a_file_in_the_way_and_a_wrong_address_are_said_as_such(tmp_path: Path):
+    (tmp_path / "file").write_text("mine")
+    refused = invoke(tmp_path / "file", "--no-ask")
+    assert (refused.exit_code, "choose another folder" in refused.stderr) == (2, True)
+    refused = invoke(tmp_path / "new", "--no-ask", "--bus", "a b:c:d")
+    assert "stand.yaml: bus.address: " in refused.stderr
+    assert "/tmp" not in refused.stderr.partition("stand.yaml")[0]
