@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 
+from drivers.devices.protocols import Controller
 from drivers.devices.relays import CAMERA_POWER
 from drivers.wires.camera_settings import GigeCameraSettings
 from drivers.wires.discovery import FoundCamera, cameras_at
 from drivers.wires.modbus_unit import ModbusUnit
-from foundation.errors import DeviceError
+from foundation.errors import DeviceError, DeviceFault
 from stand.assembly import Assembly, register_map
 from stand.config.stand_config import StandConfig
 from stand.running.opening.open_stand import at_bench
@@ -36,11 +38,18 @@ async def not_answering(config: StandConfig) -> tuple[str, ...]:
         if config.flap is not None:
             alone.append(devices.flap.open)
         if config.climate_chamber is not None:
-            alone.append(devices.regulator.open)
+            alone.append(partial(_in_force, devices.regulator))
         others = asyncio.gather(*(_asked(ask) for ask in alone))
         (on_bus, is_supplied), lacking = await asyncio.gather(_of_bus(assembly), others)
         cameras = await _of_cameras(config) if is_supplied else ()
         return (*on_bus, *(lack for lacks in lacking for lack in lacks), *cameras)
+
+
+async def _in_force(chamber: Controller) -> None:
+    """DeviceFault when its set-point would not be in force."""
+    await chamber.open()
+    if objections := (await chamber.in_force()).objections:
+        raise DeviceFault(chamber.name, f"its set-point is not in force: {'; '.join(objections)}")
 
 
 async def _of_bus(assembly: Assembly) -> tuple[Sequence[str], bool]:
