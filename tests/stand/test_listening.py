@@ -225,3 +225,26 @@ def test_the_budget_is_earned_with_time_and_spent_with_work():
     assert pace.spent() == 0.0
     used_s[0] += 0.75
     assert pace.spent() == pytest.approx(1.0)
+
+
+async def test_a_body_in_chunks_is_not_taken_apart_and_the_stop_before_it_is_done(tmp_path: Path):
+    """A megabyte of one byte each: it says so and hangs up; STOP needs no body, and does what it is asked to."""
+    chunks = b"1\r\nx\r\n" * 170_000
+    async with served(ADesk(), tmp_path) as desk:
+        for path, status in (("run/stop", b"200"), ("run/pause", b"411")):
+            head = f"POST /api/v1/{path} HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n".encode()
+            with await asyncio.to_thread(connected, tmp_path) as client:
+                client.settimeout(10.0)
+                await asyncio.to_thread(client.sendall, head + chunks[:6000])
+                with contextlib.suppress(OSError):
+                    await asyncio.to_thread(client.sendall, chunks)
+                with contextlib.suppress(ConnectionResetError):
+                    answer = await asyncio.to_thread(client.recv, 65536)
+                    assert answer.split(b" ")[1] == status
+                    assert b"connection: close" in answer.lower()
+        used_s = time.process_time()
+        with flood(tmp_path, 8, head + chunks[:60_000]):
+            await asyncio.sleep(1.0)
+            assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
+        assert time.process_time() - used_s < 10
+    assert {verb for _, verb, _ in desk.orders} == {"stop"}

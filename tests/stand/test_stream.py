@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 from websockets.asyncio.client import ClientConnection, connect, unix_connect
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 
 from foundation.items import StepMark, StepState
 from stand.serving.api import stream as streams
@@ -189,3 +191,28 @@ async def test_the_unix_socket_has_the_stream_too(tmp_path: Path):
         (daemon,) = [each for each in living() if each.entry.session == str(session)]
         async with unix_connect(str(daemon.socket), "ws://localhost/api/v1/stream") as viewer:
             assert (await message(viewer))["data"]["stand"] == "a stand"
+
+
+async def flooding(viewer: ClientConnection, what: str) -> None:
+    """Until it is disconnected."""
+    for number in range(20_000):
+        if what == "pings":
+            await viewer.ping(f"{number}")
+        else:
+            await viewer.send("x" if what == "texts" else "x" * 200_000)
+    await viewer.recv()
+    await viewer.wait_closed()
+    await viewer.ping()
+
+
+@pytest.mark.parametrize("sent", ["pings", "texts", "one large text"])
+async def test_a_viewer_that_sends_is_disconnected_and_takes_no_stop_away(tmp_path: Path, sent: str):
+    desk = ADesk()
+    async with opened(tmp_path, desk) as url, connect(url, max_size=None) as viewer, connect(url) as quiet:
+        await until(quiet, "state")
+        with pytest.raises(ConnectionClosed):
+            await flooding(viewer, sent)
+        assert viewer.close_code in (CloseCode.POLICY_VIOLATION, CloseCode.MESSAGE_TOO_BIG, CloseCode.ABNORMAL_CLOSURE)
+        assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
+        assert await quiet.ping()
+    assert [verb for _, verb, _ in desk.orders] == ["stop"]

@@ -249,7 +249,7 @@ class Gatekeeper:
         """One request, or one viewer."""
         if scope["type"] not in ("http", "websocket"):
             return
-        answering = _Answering(send, self._pace)
+        answering = _Answering(send, self._pace, is_last=scope["type"] == "http" and _is_in_chunks(scope))
         try:
             self._access.check(scope)
             who = self._access.who(scope)
@@ -270,10 +270,11 @@ class Gatekeeper:
 
 
 class _Answering:
-    """Adds the headers that every answer has, unless the route has given its own."""
+    """Adds the headers that every answer has, unless the route has given its own. is_last: nothing more is read."""
 
-    def __init__(self, send: Send, pace: Pace) -> None:
+    def __init__(self, send: Send, pace: Pace, *, is_last: bool) -> None:
         self._send = send
+        self._is_last = is_last
         self._pace = pace
         self.has_begun = False
 
@@ -282,11 +283,16 @@ class _Answering:
             own = list(message.get("headers", ()))
             given = {name.lower() for name, _ in own}
             added = [each for each in _HEADERS if each[0] not in given]
-            if self._pace.is_crowded and message["type"] == "http.response.start":
+            is_last = self._is_last or self._pace.is_crowded
+            if is_last and message["type"] == "http.response.start" and b"connection" not in given:
                 added.append((b"connection", b"close"))
             message = {**message, "headers": [*own, *added]}
         self.has_begun = self.has_begun or message["type"] != "http.response.body"
         await self._send(message)
+
+
+def _is_in_chunks(scope: Scope) -> bool:
+    return bool(_all(scope["headers"], b"transfer-encoding"))
 
 
 async def _whole_body(scope: Scope, receive: Receive) -> Receive:
@@ -294,7 +300,9 @@ async def _whole_body(scope: Scope, receive: Receive) -> Receive:
     if (length := _one(scope["headers"], b"content-length")) is not None:
         if not length.isdecimal() or int(length) > BODY_LIMIT_BYTES:
             raise Denied(413, f"a request has at most {BODY_LIMIT_BYTES} bytes")
-    elif _one(scope["headers"], b"transfer-encoding") is None:
+    elif _is_in_chunks(scope):
+        raise Denied(411, "a request says how long it is (Content-Length); a body in chunks is not read")
+    else:
         return receive
     body = bytearray()
     try:
@@ -333,7 +341,7 @@ async def _refuse(scope: Scope, send: _Answering, status: int, sentence: str) ->
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
     if status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
-    if status in (408, 413):
+    if status in (408, 411, 413):
         headers.append((b"connection", b"close"))
     await send({"type": f"{prefix}.response.start", "status": status, "headers": headers})
     await send({"type": f"{prefix}.response.body", "body": body})

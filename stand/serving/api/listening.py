@@ -20,7 +20,9 @@ from typing import Any, Protocol, cast
 
 from uvicorn.config import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
+from websockets.frames import CloseCode
 
 from stand.serving.api.pace import Pace
 from stand.serving.api.stream import json_of
@@ -35,6 +37,9 @@ _NO_DESCRIPTOR_PAUSE_S = 0.1
 _ASK_WITHIN_S = 10.0  # a whole request's head, from the first moment or the answer before
 _IDLE_LIMIT_S = 60.0
 _FAREWELL_LIMIT_S = 1.0  # for clients that do not read their last answer
+_PIECE_BYTES = 4096  # of what a client sends, looked at before more of it is taken apart
+# A browser answers a ping each 20 s with 10 bytes. A read counts as 64 bytes at least: eight a second, 64 at once.
+_VIEWER_BYTES_PER_S, _VIEWER_BURST_BYTES, _LEAST_BYTES = 512, 4096, 64
 _PEER = struct.Struct("3i")
 
 
@@ -57,9 +62,23 @@ class _Client(H11Protocol):
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """As ever."""
+        """As ever, but for a body in chunks, which is refused and not taken apart: of one byte each, a megabyte of them
+        keeps the thread, and STOP with it, for half a minute."""
         self.heard_s = self.loop.time()
-        super().data_received(data)
+        for begin in range(0, len(data), _PIECE_BYTES):
+            if self._is_in_chunks:
+                return
+            super().data_received(data[begin : begin + _PIECE_BYTES])
+            if self.transport.get_protocol() is not self:  # it is a viewer from here on
+                self.transport.get_protocol().data_received(data[begin + _PIECE_BYTES :])  # pyright: ignore[reportAttributeAccessIssue]
+                return
+
+    @property
+    def _is_in_chunks(self) -> bool:
+        """Whether the request under way, or the last one, has its body in chunks."""
+        return self.cycle is not None and any(  # pyright: ignore[reportUnnecessaryComparison]
+            name == b"transfer-encoding" for name, _ in self.scope["headers"]
+        )
 
     def send_400_response(self, msg: str) -> None:
         """A sentence, as for everything that is refused."""
@@ -71,6 +90,32 @@ class _Client(H11Protocol):
         return self.cycle is not None and not self.cycle.response_complete  # pyright: ignore[reportUnnecessaryComparison]
 
 
+class _Viewer(WebSocketsSansIOProtocol):
+    """One viewer. It has nothing to say but the answers to our pings, so that little of what it sends is ever looked
+    at: one that says more is disconnected, before anything is done for it."""
+
+    _heard_s = 0.0
+    _budget_bytes = 0.0
+    _has_asked = False
+
+    def data_received(self, data: bytes) -> None:
+        """As ever, within the budget; the first is the request."""
+        now_s = self.loop.time()
+        if not self._has_asked:
+            self._has_asked, self._budget_bytes = True, float(_VIEWER_BURST_BYTES)
+        else:
+            earned_bytes = (now_s - self._heard_s) * _VIEWER_BYTES_PER_S
+            self._budget_bytes = min(self._budget_bytes + earned_bytes, _VIEWER_BURST_BYTES)
+            self._budget_bytes -= max(len(data), _LEAST_BYTES)
+        self._heard_s = now_s
+        if self._budget_bytes >= 0:
+            super().data_received(data)
+        elif not self.transport.is_closing():
+            self.conn.fail(CloseCode.POLICY_VIOLATION, "a viewer has nothing to say")
+            self.transport.write(b"".join(self.conn.data_to_send()))
+            self.transport.close()
+
+
 class Listening:
     """Accepts at listening sockets for `app` until closed."""
 
@@ -78,7 +123,7 @@ class Listening:
         self._config = Config(
             app,
             http="h11",
-            ws="websockets-sansio",
+            ws=_Viewer,
             lifespan="off",
             interface="asgi3",
             log_config=None,
