@@ -21,7 +21,12 @@ KEYED = {"add", "discard", "get", "pop", "setdefault", "count"}
 # What each sentence comes from: a function without one of these need not be visited, which takes 3 s for all.
 _SOURCE = re.compile(r"\.(text|reason|args)\b|\b(str|repr)\(")
 # Shown, not decided upon: the sentence of an error with the file's name as it is within the session.
-SHOWN = {("recording/reading/glance.py", "within")}
+SHOWN = {
+    ("recording/reading/glance.py", "within"),
+    ("compensation/commands/photographs_cli.py", "views_of"),
+    # Compared with what was said before and nothing else: whether a message repeats.
+    ("foundation/repeats.py", "admit"),
+}
 
 
 class Reader(ast.NodeVisitor):

@@ -35,7 +35,7 @@ from experiments.steps import (
 )
 from experiments.steps import Step as PlanStep
 from foundation.clock import NS_PER_S, Clock
-from foundation.errors import ConfigError, DeviceError
+from foundation.errors import ConfigError, DeviceError, Superseded
 from foundation.hub import Hub
 from foundation.items import StepMark, StepState
 from foundation.tasks import cancelled, first_of
@@ -213,7 +213,7 @@ class Executor:
             await self._act(action)
         except (DeviceError, Interlocked) as error:
             if self._state.disturbances == state.disturbances:
-                if isinstance(error, Interlocked):
+                if isinstance(error, Interlocked | Superseded):  # a stop, or somebody's newer order: no fault
                     raise
                 self._meet(error)
                 if not self._stand.gate.reasons:  # nothing would keep it from being tried again and again
