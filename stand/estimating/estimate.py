@@ -262,6 +262,10 @@ def check_step(planned: PlannedStep, config: StandConfig) -> None:
         raise ConfigError(
             f"{where}: needs a camera, and this stand has none; name it under cameras in the stand's file"
         )
+    if step == PowerCamera(on=False) and config.relays is None:
+        raise ConfigError(
+            f"{where}: no relay switches the cameras, which stay on: this stand has no relay board; leave it out"
+        )
     if isinstance(step, Capture) and (unknown := [name for name in step.cameras if name not in config.cameras]):
         known = ", ".join(config.cameras) or "none"
         raise ConfigError(f"{where}: this stand has no camera {unknown[0]}; it has {known}")

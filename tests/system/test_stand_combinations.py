@@ -243,6 +243,9 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
         if not data[key]:
             with pytest.raises(ConfigError, match=sentence):
                 check_plan(recipe(does).plan(), config)
+    if data["cameras"] and config.relays is None:
+        with pytest.raises(ConfigError, match="no relay switches the cameras"):
+            check_plan(recipe([{"power_camera": False}]).plan(), config)
     said = [sentence.partition(":")[0] for sentence in absences(config)]
     expected = [absent for choice in combination for absent in choice.absent]
     if "granite_inside" in data["thermometers"]:  # ours is not controlled by the only one
