@@ -71,7 +71,8 @@ def serve(
     tokens, hosts = load_tokens(stand.interface.secrets), stand.interface.hosts
     secop_port = stand.interface.secop_port if secop is None else secop
     others = () if secop_port is None else (door_at(secop_port),)
-    interface = Interface(directory, host, port, tokens, hosts, others)
+    trusts = stand.interface.trust_loopback
+    interface = Interface(directory, host, port, tokens, hosts, trusts_loopback=trusts, doors=others)
     interface.check()
     try_doors(interface)
 
@@ -86,6 +87,9 @@ def serve(
             event = Event(clock.now_ns(), "info", "open", opened, {"sessions": str(directory), "port": port})
             _tell_json(event) if output().as_json else say(opened)
             with _events_shown(hub):
+                if tokens and trusts and (port is not None or others):
+                    text = "every program of this machine operates this stand without a token (trust_loopback)"
+                    hub.publish(Event(clock.now_ns(), "warning", "loopback_trusted", text))
                 yield
 
     asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))

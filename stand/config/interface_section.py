@@ -23,8 +23,11 @@ class InterfaceConfig(Document):
     programs reach it, besides this machine's own, such as that of a proxy. secrets: a YAML file (mode 0600) with
     `tokens`, by the name of who has them; `stand token add` writes it, and it is never recorded or shown. secop_port:
     where `stand serve` answers SECoP on this machine, usually 10767, as with --secop; not at all without it.
+    trust_loopback: where there are tokens, who asks from this machine needs none all the same; a proxy on this machine
+    that adds no header then makes everybody behind it an operator.
     """
 
+    trust_loopback: bool = False
     hosts: tuple[HostName, ...] = Field(default=(), max_length=50)
     secrets: Path | None = None
     secop_port: int | None = Field(default=None, ge=1, le=65535)

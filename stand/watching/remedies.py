@@ -74,6 +74,7 @@ _OF_KIND = {
     "daemon_file_damaged": "read the counters in the damaged file, if they matter",
     "latch_not_cleared": "`stand clear` again, when the disk answers",
     "latch_not_kept": "see that the folder of the stand's state is there and has room",
+    "loopback_trusted": "take `interface.trust_loopback` out of the stand's file when that is not wanted",
     "limits_accepted": "take `guard.accept` out of the stand's file when that is not wanted",
     "no_camera_temperature": "name the camera's temperature in the stand's file, if it has one: `stand check`",
     "no_control": "Ctrl-C where it was begun still stops the run",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from compensation.observations import Observations, concatenate, observe_session
 from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from foundation.errors import ConfigError, SessionError
-from foundation.instants import utc_text
+from foundation.instants import local_text
 from markers.detection import Flag
 from recording.format.records import frame_places
 from recording.format.restarts import restarted
@@ -104,7 +105,7 @@ def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
     data = bytearray(segment.read_bytes())
     data[place.chunk.offset + place.chunk.length // 2] ^= 0xFF
     segment.write_bytes(data)
-    when = utc_text(place.time_ns)
+    when = re.escape(local_text(place.time_ns))
     with pytest.raises(SessionError, match=rf"{segment.name}: .*; this was the frame of {when}$"):
         observe_session(session, session_target(session))
 

@@ -14,7 +14,7 @@ from websockets.asyncio.client import connect
 from foundation.errors import ConfigError
 from stand.serving.api import access
 from stand.serving.api.access import BODY_LIMIT_BYTES, COOKIE, CSP, STOP_PATH, Access, is_open
-from stand.serving.api.doors import Interface
+from stand.serving.api.doors import Interface, OtherDoor
 from stand.serving.client import server_at
 from tests.stand.a_desk import ADesk, served
 
@@ -42,6 +42,9 @@ HOSTILE = (
 )
 
 
+BARE_PROXY = "anybody behind a proxy on this machine that adds no header"
+
+
 def free_port() -> int:
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
@@ -49,9 +52,10 @@ def free_port() -> int:
 
 
 @asynccontextmanager
-async def open_stand(folder: Path) -> AsyncIterator[tuple[ADesk, int]]:
+async def open_stand(folder: Path, *, trusts_loopback: bool = True) -> AsyncIterator[tuple[ADesk, int]]:
     port = free_port()
-    interface = Interface(folder, port=port, tokens={"rose": TOKEN}, hosts=("stand.example",))
+    tokens, hosts = {"rose": TOKEN}, ("stand.example",)
+    interface = Interface(folder, port=port, tokens=tokens, hosts=hosts, trusts_loopback=trusts_loopback)
     async with served(ADesk(), folder / "night", interface) as desk:
         yield desk, port
 
@@ -77,7 +81,7 @@ def ask(
 
 def routes(port: int) -> list[tuple[str, str]]:
     """All that the published document has, and what it has not."""
-    document = json.loads(ask(port, "GET", "/openapi.json")[2])
+    document = json.loads(ask(port, "GET", "/openapi.json", {"Authorization": f"Bearer {TOKEN}"})[2])
     found = [(method.upper(), path.format(**NAMES)) for path, entry in document["paths"].items() for method in entry]
     return [*found, ("GET", "/"), ("GET", "/static/page.js"), ("GET", "/openapi.json"), ("GET", "/login")]
 
@@ -97,11 +101,13 @@ def routes(port: int) -> list[tuple[str, str]]:
         ("a wrong token here", {"Authorization": f"Basic {TOKEN}"}, 401),
         ("a name of this stand without a token", {"Host": "stand.example"}, 401),
         ("a wrong cookie", {**PROXIED, "Cookie": f"{COOKIE}=x"}, 401),
+        (BARE_PROXY, {}, 401),
+        (BARE_PROXY, {"Host": "127.0.0.1"}, 401),
     ],
 )
 async def test_every_route_refuses(tmp_path: Path, attack: str, headers: dict[str, str], status: int):
     of_host = "Host" in headers and status == 403
-    async with open_stand(tmp_path) as (desk, port):
+    async with open_stand(tmp_path, trusts_loopback=attack != BARE_PROXY) as (desk, port):
         found, wrong = await asyncio.to_thread(routes, port), []
         assert len(found) > 25
         for method, path in found:
@@ -248,6 +254,11 @@ def test_a_wide_bind_without_a_token_is_refused(tmp_path: Path):
         Interface(tmp_path, host=host, port=1, tokens={"rose": TOKEN}).check()
     for host in ("127.0.0.1", "::1", "localhost", "127.1.2.3"):
         Interface(tmp_path, host=host, port=1).check()
+    other = OtherDoor("--secop", "127.0.0.1", 1, lambda *_: asyncio.sleep(0))
+    Interface(tmp_path, doors=(other,)).check()
+    Interface(tmp_path, tokens={"rose": TOKEN}, doors=(other,), trusts_loopback=True).check()
+    with pytest.raises(ConfigError, match=r"--secop: .* set interface\.trust_loopback: true"):
+        Interface(tmp_path, tokens={"rose": TOKEN}, doors=(other,)).check()
     assert TOKEN not in repr(Interface(tmp_path, tokens={"rose": TOKEN}))
 
 

@@ -3,8 +3,8 @@
 - Host: the names of this stand only, also on loopback: a page of another site must not reach it under a name of its
   own that leads here (DNS rebinding).
 - Origin: what changes something, and the stream, is taken from the stand's own page or from what is no browser.
-- Token: for everything that comes neither through the Unix socket nor from this machine. A request that a proxy passed
-  on comes from wherever the proxy says.
+- Token: for everything that does not come through the Unix socket, which proves who asks. Where the stand has no
+  tokens, or its file trusts loopback, this machine needs none: a proxy on it that adds no header makes everybody local.
 - STOP needs no token and is never delayed; it keeps the checks of Host and Origin.
 - Sizes and times of bodies are limited, and answers carry what a browser needs to be strict with them.
 """
@@ -76,6 +76,7 @@ class Access:
 
     tokens: Mapping[str, str] = field(default_factory=dict[str, str])
     hosts: Iterable[str] = ()
+    trusts_loopback: bool = False
 
     def __post_init__(self) -> None:
         names = {socket.gethostname().lower(), *(host.lower() for host in self.hosts)}
@@ -113,7 +114,8 @@ class Access:
         name = self._named(headers)
         if name is not None:
             return Who(name=name, how="token")
-        return Who(name="", how="loopback") if _is_local(scope, headers) else None
+        needs_token = bool(self._hashes) and not self.trusts_loopback
+        return Who(name="", how="loopback") if not needs_token and _is_local(scope, headers) else None
 
     def check(self, scope: Scope) -> None:
         """Host and Origin; Denied."""

@@ -30,8 +30,9 @@ class Interface:
     """How a stand is reached besides its Unix socket.
 
     host, port: to listen at by TCP; no port, no TCP. tokens: by name. hosts: names of this stand besides this machine's
-    own. doors: other protocols' ports. sessions: the folder of recorded sessions. rooms: makes what else is served
-    (history, frames, the page) in the thread, as routers, by the bridge.
+    own. trusts_loopback: whoever asks from this machine needs no token, though there are some. doors: other protocols'
+    ports. sessions: the folder of recorded sessions. rooms: makes what else is served (history, frames, the page) in
+    the thread, as routers, by the bridge.
     """
 
     sessions: Path
@@ -39,6 +40,7 @@ class Interface:
     port: int | None = None
     tokens: dict[str, str] = field(default_factory=dict[str, str], repr=False)
     hosts: tuple[str, ...] = ()
+    trusts_loopback: bool = False
     doors: tuple[OtherDoor, ...] = ()
     rooms: Sequence[Callable[[Bridge], Any]] = ()
 
@@ -51,7 +53,13 @@ class Interface:
         return f"http://[{name}]:{self.port}" if ":" in name else f"http://{name}:{self.port}"
 
     def check(self) -> None:
-        """ConfigError when everybody on the network could operate the stand."""
+        """ConfigError when everybody on the network could operate the stand, or a port asks for no token where others
+        do."""
+        if self.tokens and self.doors and not self.trusts_loopback:
+            raise ConfigError(
+                f"{self.doors[0].option}: this protocol has no tokens, and this stand asks for one; set "
+                "interface.trust_loopback: true in its file if every program of this machine may operate it"
+            )
         if self.port is not None and not self.tokens and not is_loopback(self.host):
             raise ConfigError(
                 f"--host {self.host}: others on the network could operate this stand; make a token with "

@@ -183,7 +183,7 @@ class _Thread:
         from stand.serving.api.stream import Stream
 
         pace, stream = Pace(), Stream(self._bridge)
-        access = Access(self._interface.tokens, self._interface.hosts)
+        access = Access(self._interface.tokens, self._interface.hosts, self._interface.trusts_loopback)
         app = make_app(self._bridge, stream, access, pace, self._interface, self._failed)
         listening = Listening(app, pace)
         self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
