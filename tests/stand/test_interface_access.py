@@ -277,3 +277,13 @@ async def test_a_viewer_has_nothing_long_to_say(tmp_path: Path):
         async with asyncio.timeout(20):
             await viewer.wait_closed()
         assert viewer.close_code == 1008
+
+
+async def test_what_can_be_asked_for_answers_to_head_without_a_body(tmp_path: Path):
+    async with open_stand(tmp_path) as (_, port):
+        for path in ("/healthz", "/openapi.json", "/api/v1/state"):
+            whole = await asyncio.to_thread(ask, port, "GET", path)
+            head = await asyncio.to_thread(ask, port, "HEAD", path)
+            assert (head[0], head[2]) == (200, b"")
+            assert head[1]["content-type"] == whole[1]["content-type"]
+        assert (await asyncio.to_thread(ask, port, "HEAD", "/api/v1/run/pause"))[0] == 405

@@ -258,6 +258,8 @@ class Gatekeeper:
             if who is None and not is_open(scope["path"]):
                 raise Denied(401, "this needs a token: an Authorization header, or the address of `stand token login`")
             scope["state"] = {**(scope.get("state") or {}), "who": who or Who(name="", how="token")}
+            if scope.get("method") == "HEAD":  # as GET; uvicorn sends the head of its answer only
+                scope = {**scope, "method": "GET"}
             if scope["type"] == "http" and scope["path"] != STOP_PATH:
                 await self._pace.turn()
                 receive = await _whole_body(scope, receive)

@@ -56,7 +56,7 @@ def make_app(
         docs_url=None,  # pages of another site
         redoc_url=None,
         redirect_slashes=False,
-        responses={403: _ERROR, 401: _ERROR, 422: _ERROR},
+        responses=dict.fromkeys(_REFUSED, _ERROR),
     )
     app.include_router(reads(bridge, stream, access, interface.url))
     app.include_router(commands(bridge))
@@ -71,6 +71,8 @@ def make_app(
     return Gatekeeper(cast("App", app), access, pace, failed)
 
 
+# By who may ask (401, 403, 408, 411, 413), by what was asked (400, 422), and by _STATUS.
+_REFUSED = sorted({400, 401, 403, 408, 411, 413, 422, 503, *(status for _, status in _STATUS)})
 _ERROR: dict[str, Any] = {
     "description": "What is wrong, in a sentence",
     "content": {
