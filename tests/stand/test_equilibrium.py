@@ -14,7 +14,7 @@ from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from stand.imaging.camera_cooling import CameraTemperature
-from stand.imaging.equilibrium import CameraEquilibrium
+from stand.imaging.equilibrium import LOST, CameraEquilibrium
 from stand.running.executing.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
 from stand.running.executing.settling_watch import SettlingWatch
 
@@ -123,6 +123,22 @@ def test_camera_minus_air_is_compared_once_at_the_nearest_set_point(after_K, kin
         "gap_ns": 7,
         "gap_end_ns": 9,
     }
+
+
+def test_a_camera_that_still_warms_up_is_no_offset_to_compare_with():
+    hub, clock, events = Hub(), VirtualClock(1000 * NS_PER_S), []
+    hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
+    watch = OffsetWatch(hub, clock)
+    for time_s in range(900, 1001, 5):
+        publish(hub, "camera.temperature", time_s * NS_PER_S, 41.0 + 0.02 * (time_s - 900))
+        publish(hub, "thermometers.air", time_s * NS_PER_S, 38.0)
+    watch.settled(38.0)
+    hub.publish(Event(clock.now_ns(), "warning", LOST, "its supply was off", {}))
+    for time_s in range(1001, 1200, 5):
+        publish(hub, "camera.temperature", time_s * NS_PER_S, 55.0)
+        publish(hub, "thermometers.air", time_s * NS_PER_S, 38.0)
+    watch.settled(38.0)
+    assert [event.kind for event in events] == [LOST]
 
 
 def test_what_is_kept_of_a_camera_does_not_grow_with_the_hours():
