@@ -11,7 +11,7 @@ import pytest
 from foundation.clock import NS_PER_S
 from foundation.hub import Hub
 from recording.reading.session import Session
-from stand.running.memory.entries import Dwell, Gap
+from stand.running.memory.entries import Dwell
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.run import run_virtual
@@ -86,7 +86,7 @@ async def test_a_soak_with_a_cold_camera_is_not_credited(tmp_path: Path, order: 
     assert powered[powered_ns > restarts[0] + 60 * NS_PER_S].min() == 1
 
 
-def test_after_a_power_cut_the_camera_is_soaked_again_and_compared_with_itself(
+def test_after_a_power_cut_the_camera_is_soaked_again(
     tmp_path: Path, order: Callable[..., Order]
 ):
     """The laboratory that a run is resumed in has no camera on: its supply is found off."""
@@ -102,11 +102,5 @@ def test_after_a_power_cut_the_camera_is_soaked_again_and_compared_with_itself(
     assert lost.data == {"reason": "its supply was found off after the gap"}
     assert "soak_restarted" in [event.kind for event in after]
     check_soaked(session, lost.time_ns)
-    (compared,) = [event for event in after if event.kind.startswith("camera_offset_")]
-    before_K, after_K = compared.data["before_K"], compared.data["after_K"]
-    assert isinstance(before_K, float)
-    assert isinstance(after_K, float)
-    is_changed = abs(after_K - before_K) > 1.0  # soaks as short as here leave the camera on its way
-    assert compared.kind == ("camera_offset_changed" if is_changed else "camera_offset_same")
-    (journaled,) = [entry for entry in read_lines((directory / JOURNAL_NAME).read_bytes())[0] if isinstance(entry, Gap)]
-    assert (compared.data["gap_ns"], compared.data["gap_end_ns"]) == (journaled.from_ns, journaled.time_ns)
+    # Soaks as short as here leave the camera on its way: there is nothing to compare (tests/stand/test_equilibrium.py).
+    assert [event.kind for event in after if event.kind.startswith("camera_offset_")] == []
