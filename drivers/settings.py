@@ -63,6 +63,8 @@ class CameraSettings(Polled):
     no GOOD one then. boot_s: from its supply being switched on until it answers.
     ambient_degC: the lowest and the highest air that its data sheet allows; no set-point goes outside.
     ambient_K_per_min: how fast that air may change; no set-point changes faster.
+    self_heating_K: how far above the air near it its own temperature is at rest, lowest and highest, negative for a
+    cooled one; outside it is doubted. None: above that air.
     lens: which one is on it, in words; recorded with each session.
     """
 
@@ -78,6 +80,7 @@ class CameraSettings(Polled):
     boot_s: float = Field(default=8.0, ge=0, le=600)
     ambient_degC: Range | None = None
     ambient_K_per_min: float | None = Field(default=None, gt=0, le=20)
+    self_heating_K: Range | None = None
     lens: Line = ""
     equilibrium: EquilibriumSettings = EquilibriumSettings()
 

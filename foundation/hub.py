@@ -40,7 +40,7 @@ class Hub:
                 self._latest[reading.channel] = reading
                 if reading.cause != "wire":
                     self._known[reading.channel] = reading
-                if reading.quality is Quality.GOOD:
+                if reading.quality is Quality.GOOD or reading.cause == "doubt":
                     self._good_ns[reading.channel] = reading.time_ns
         if self._limit is not None and isinstance(item, Event):
             admitted = self._limit.admit(item)
@@ -65,5 +65,5 @@ class Hub:
         return self._known.get(channel)
 
     def last_good_ns(self, channel: str) -> int | None:
-        """When `channel` last gave a GOOD reading, or None when it never did."""
+        """When `channel` was last measured, GOOD or with a value in doubt, or None when it never was."""
         return self._good_ns.get(channel)

@@ -21,8 +21,9 @@ class Quality(StrEnum):
 
 # Why a reading is BAD: "wire", the poll failed or its reply was garbled, and the device may be all right; "device", the
 # device itself says that it has no measurement (sensor break, converter error, out of range); "" when that is unknown.
-# Why one is STALE: "alarm", the device is in an alarm of its own; "" otherwise.
-Cause = Literal["", "wire", "device", "alarm"]
+# Why one is STALE: "alarm", the device is in an alarm of its own; "doubt", it was measured, but its value is not to be
+# believed (jumped, noisy, stuck); "" otherwise.
+Cause = Literal["", "wire", "device", "alarm", "doubt"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,12 +36,12 @@ from stand.chamber.permits import PermitLimits
 from stand.config.stand_config import StandConfig, packaged
 from stand.estimating.camera_lines import sharing
 from stand.fault import Fault
-from stand.guarding.frozen import marking_stale
+from stand.guarding.channels import ChannelCheck
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording, Watch, heat_uncontrolled, intrusion
 from stand.guarding.met_errors import MetErrors
 from stand.guarding.notify import Notifier
-from stand.guarding.rules import Announcements, camera_measured, camera_stale, recorded, vital, watches
+from stand.guarding.rules import Announcements, camera_measured, natures, recorded, vital, watches
 from stand.imaging.camera_supply import SupplyLimits
 from stand.poller import Poller
 from stand.stand import Devices, Stand
@@ -60,6 +60,7 @@ class Assembly:
     devices: Devices
     stand: Stand
     notifier: Notifier  # notifies people when nobody is at the stand
+    channels: ChannelCheck
 
     def pollers(self) -> tuple[Poller, ...]:
         """One per device, in the order in which they are read when several are due at one instant."""
@@ -93,11 +94,17 @@ class Assembly:
                 else ()
             ),
         ]
-        pollers = tuple(Poller(sensor, period_s, self.hub, self.clock) for sensor, period_s in timed)
-        for poller in pollers:
-            if (name := poller.sensor.name) in devices.cameras:
-                poller.mark = marking_stale(f"{name}.temperature", camera_stale(config, name), self.hub)
-        return pollers
+        return tuple(
+            Poller(sensor, period_s, self.hub, self.clock, self.channels.marking(self._module(sensor)))
+            for sensor, period_s in timed
+        )
+
+    def _module(self, sensor: Sensor) -> str:
+        """What a device with several temperatures is called, so that it is found."""
+        if not isinstance(sensor, Thermometers):
+            return sensor.name
+        number = self.devices.thermometers.modules.index(sensor)
+        return f"{sensor.name} (unit {self.config.thermometer_module.units[number]} at {self.config.bus.address})"
 
     def guard(
         self,
@@ -183,7 +190,8 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     stand = Stand(devices, chamber, supply, hub, clock)
     if isinstance(regulator, SoftwareRegulator):
         regulator.permitted = lambda: stand.chamber.permits.gives
-    return Assembly(config, hub, clock, bus, devices, stand, notifier)
+    check = ChannelCheck(natures(config), config.guard.sensors, config.guard.frozen, hub.publish)
+    return Assembly(config, hub, clock, bus, devices, stand, notifier, check)
 
 
 def bus_units(

@@ -23,7 +23,7 @@ class Readings(Protocol):
         ...
 
     def last_good_ns(self, channel: str) -> int | None:
-        """When the channel last gave a GOOD reading."""
+        """When the channel was last measured, GOOD or with a value in doubt."""
         ...
 
 
@@ -36,7 +36,8 @@ class Fault:
     """What a rule objects to, and what has to be done about it.
 
     ends_itself: the hold is over when the rule objects no more; else an operator has to clear it. cuts_camera: the
-    camera's supply is switched off as well.
+    camera's supply is switched off as well. channels: the two that contradict each other, where a rule compares them;
+    suspect: which of them moved unlike the rest, "" where that cannot be told.
     """
 
     rule: str
@@ -44,11 +45,14 @@ class Fault:
     action: Action = "abort"
     ends_itself: bool = False
     cuts_camera: bool = False
+    channels: tuple[str, ...] = ()
+    suspect: str = ""
 
     @property
     def data(self) -> dict[str, JsonValue]:
         """What a program needs to know of it besides its words."""
-        return {"action": self.action, "ends_itself": self.ends_itself}
+        compared: dict[str, JsonValue] = {"channels": list(self.channels), "suspect": self.suspect}
+        return {"action": self.action, "ends_itself": self.ends_itself, **(compared if self.channels else {})}
 
 
 def value_of(readings: Readings, channel: str) -> float:
@@ -56,3 +60,9 @@ def value_of(readings: Readings, channel: str) -> float:
     NaN when the device says itself that it has none, or it was never read, and every comparison with that is false."""
     reading = readings.known(channel)
     return math.nan if reading is None else reading.value
+
+
+def in_doubt(readings: Readings, channel: str) -> bool:
+    """Whether its last value is not to be believed."""
+    reading = readings.known(channel)
+    return reading is not None and reading.cause == "doubt"

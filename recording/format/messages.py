@@ -140,7 +140,7 @@ CLASSES: Mapping[str, type[Message]] = {
     ORIGINAL: CompressedImage,
 }
 
-CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "alarm"}
+CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "alarm", "doubt": "doubt"}
 LOG_LEVEL = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 

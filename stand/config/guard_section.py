@@ -52,11 +52,11 @@ class CoolingConfig(Document):
 class SensorsConfig(Document):
     """Thermometers against each other, and values that do not change. A difference of the air's from the regulator's
     probe, or from a safety thermometer, above warn_K for warn_after_s is a warning; one of air and probe above trip_K
-    for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A thermometer that is exactly
-    constant for stuck_after_s is a warning; the regulator's value constant for pv_stuck_after_s while the air moves by
-    air_moves_K is a fault. A thermometer that moves by more than jump_K within jump_within_s from one reading to the
-    next is a warning: a contact, a cable, not a temperature. drift_K: a change of the difference of two in the same
-    air, at a set-point that is held again, is a warning.
+    for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A thermometer in fine steps
+    that is exactly constant for stuck_after_s is in doubt; the regulator's value constant for pv_stuck_after_s while
+    the air moves by air_moves_K is a fault. A temperature that moves by more than jump_K beyond its trend and its step
+    within jump_within_s is in doubt: a contact, a cable, not a temperature. drift_K: a change of the difference of two
+    in the same air, at a set-point that is held again, is a warning.
     """
 
     warn_K: float = Field(default=3.0, gt=0, le=20)

@@ -12,6 +12,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
+from stand.guarding.suspects import Suspicion
 
 _NEAR_K = 1.0  # of the set-point, or it is not held
 _STILL_AFTER_S, _MEAN_S = 3600.0, 600.0  # walls have followed by then; over which a mean is taken
@@ -21,20 +22,24 @@ Key = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class _Held:
-    """The set-point and what else is as it was, since when; the sum over the readings of the mean under way; what each
-    such state had at first (K, ns), and what is to be said."""
+    """The set-point and what else is as it was, since when; the sums over the readings of the means under way, of
+    channel minus other and minus each third; what each such state had at first (K, ns), and what is to be said."""
 
     key: Key
     since_ns: int
-    sum_K: float = 0.0
+    sums_K: tuple[float, ...] = ()
     count: int = 0
-    first: Mapping[Key, tuple[float, int]] = field(default_factory=dict[Key, tuple[float, int]])
+    first: Mapping[Key, tuple[tuple[float, ...], int]] = field(default_factory=dict[Key, tuple[tuple[float, ...], int]])
     fault: Fault | None = None
 
 
-def drifting(channel: str, other: str, set_point: str, same: Sequence[str], limit_K: float) -> Rule:
+def drifting(
+    pair: tuple[str, str], set_point: str, same: Sequence[str], limit_K: float, thirds: Sequence[str] = ()
+) -> Rule:
     """The difference of both, held at a set-point, has changed by more than `limit_K` since that was first held, with
-    the channels `same` (0 or 1: flap, supplies) as they were."""
+    the channels `same` (0 or 1: flap, supplies) as they were. thirds: others in that air, which show who of both it
+    is."""
+    channel, other = pair
 
     def step(last: _Held | None, readings: Readings, now_ns: int) -> tuple[_Held | None, Fault | None]:
         sp_degC, value_degC = value_of(readings, set_point), value_of(readings, channel)
@@ -46,23 +51,40 @@ def drifting(channel: str, other: str, set_point: str, same: Sequence[str], limi
         held_s = (now_ns - last.since_ns) / NS_PER_S
         if held_s < _STILL_AFTER_S:
             return last, last.fault
-        held = replace(last, sum_K=last.sum_K + difference_K, count=last.count + 1)
+        apart_K = (difference_K, *(value_degC - value_of(readings, third) for third in thirds))
+        sums_K = last.sums_K or (0.0,) * len(apart_K)
+        held = replace(last, sums_K=tuple(a + b for a, b in zip(sums_K, apart_K, strict=True)), count=last.count + 1)
         if held_s >= _STILL_AFTER_S + _MEAN_S:
             held = _compared(held, now_ns)
         return held, held.fault
 
     def _compared(held: _Held, now_ns: int) -> _Held:
-        mean_K = held.sum_K / held.count
-        first_K, first_ns = held.first.get(held.key, (mean_K, now_ns))
+        means_K = tuple(sum_K / held.count for sum_K in held.sums_K)
+        first_K, first_ns = held.first.get(held.key, (means_K, now_ns))
         known = {**held.first, held.key: (first_K, first_ns)}
-        hours, change_K = (now_ns - first_ns) / NS_PER_S / 3600, mean_K - first_K
+        hours, changes_K = (now_ns - first_ns) / NS_PER_S / 3600, [b - a for a, b in zip(first_K, means_K, strict=True)]
         fault = None
-        if abs(change_K) > limit_K:
+        if abs(changes_K[0]) > limit_K:
             text = (
-                f"{channel} minus {other} at {held.key[0]:g} degC has changed by {1e3 * change_K:+.0f} mK in "
-                f"{hours:.1f} h ({1e3 * change_K / hours:+.1f} mK/h): one of them drifts; compare both with a third"
+                f"{channel} minus {other} at {held.key[0]:g} degC has changed by {1e3 * changes_K[0]:+.0f} mK in "
+                f"{hours:.1f} h ({1e3 * changes_K[0] / hours:+.1f} mK/h)"
             )
-            fault = Fault("sensor_drifts", text)
+            found = _suspicion(changes_K)
+            fault = Fault("sensor_drifts", text + found.words(pair), channels=pair, suspect=found.suspect)
         return _Held(held.key, now_ns - seconds_ns(_STILL_AFTER_S), first=known, fault=fault)
+
+    def _suspicion(changes_K: Sequence[float]) -> Suspicion:
+        """By the thirds, each of which has to be nearer to one of both by twice."""
+        of_channel, of_other = list[str](), list[str]()
+        for third, from_channel_K in zip(thirds, changes_K[1:], strict=True):
+            from_other_K = from_channel_K - changes_K[0]
+            if abs(from_channel_K) > 2 * abs(from_other_K):
+                of_channel.append(third)
+            elif abs(from_other_K) > 2 * abs(from_channel_K):
+                of_other.append(third)
+        if len(of_channel) == len(of_other):
+            return Suspicion()
+        is_channel = len(of_channel) > len(of_other)
+        return Suspicion(channel if is_channel else other, tuple(of_channel if is_channel else of_other))
 
     return remembering(step)

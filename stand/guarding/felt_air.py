@@ -18,6 +18,7 @@ from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
+_COVERAGE = 3.0  # with 1 K of noise in the granite its rate says nothing of the air
 _GAP_S = 60.0  # between two readings; after a longer one the window begins again
 
 
@@ -33,18 +34,19 @@ class Look:
 @dataclass(frozen=True, slots=True)
 class Felt:
     """Over one window: the air as the body feels it, as the probe shows it, and the body itself, degC; what the probe
-    has risen, K."""
+    has risen, K. uncertain_K: of the air that is felt, by the scatter of the body, with k = 3."""
 
     air_degC: float
     probe_degC: float
     body_degC: float
     probe_risen_K: float
+    uncertain_K: float = 0.0
 
     def excess_K(self, limits: GraniteFeelsConfig | CameraFeelsConfig) -> float:
         """How far the air that is felt is above all that is allowed; below 0 all is well. A probe that rises fast has a
         lag of its own, and is neither stuck nor outside."""
         apart_K = abs(self.probe_degC - self.body_degC)
-        allowed_K = limits.limit_K + limits.share * apart_K + max(0.0, self.probe_risen_K)
+        allowed_K = limits.limit_K + limits.share * apart_K + max(0.0, self.probe_risen_K) + self.uncertain_K
         return self.air_degC - self.probe_degC - allowed_K
 
 
@@ -58,15 +60,18 @@ def felt(looks: Sequence[Look], window_s: float, lag_s: float) -> Felt | None:
     times_s = [(look.time_ns - looks[0].time_ns) / NS_PER_S for look in looks[1:-1]]
     middle_s, body_degC = fmean(times_s), fmean(bodies_degC)
     product = sum((at - middle_s) * (each - body_degC) for at, each in zip(times_s, bodies_degC, strict=True))
-    rate_K_s = product / sum((at - middle_s) ** 2 for at in times_s)
+    spread_s2 = sum((at - middle_s) ** 2 for at in times_s)
+    rate_K_s = product / spread_s2
+    bends_K2 = [(c - 2 * b + a) ** 2 for a, b, c in zip(read_degC, read_degC[1:], read_degC[2:], strict=False)]
     probe_degC, risen_K = fmean(look.probe_degC for look in looks), looks[-1].probe_degC - looks[0].probe_degC
-    return Felt(body_degC + lag_s * rate_K_s, probe_degC, body_degC, risen_K)
+    uncertain_K = _COVERAGE * lag_s * math.sqrt(fmean(bends_K2) / 6 / spread_s2)  # 6: of white noise
+    return Felt(body_degC + lag_s * rate_K_s, probe_degC, body_degC, risen_K, uncertain_K)
 
 
 def looked(looks: tuple[Look, ...], readings: Readings, body: str, probe: str, window_s: float) -> tuple[Look, ...]:
-    """The window with what is new, if that is a measurement; a new one after a gap."""
+    """The window with what is new, if that is a measurement which is not in doubt; a new one after a gap."""
     reading, probe_degC = readings.latest(body), value_of(readings, probe)
-    if reading is None or math.isnan(reading.value) or math.isnan(probe_degC):
+    if reading is None or math.isnan(reading.value) or reading.cause == "doubt" or math.isnan(probe_degC):
         return looks
     if looks and reading.time_ns <= looks[-1].time_ns:
         return looks
@@ -101,7 +106,7 @@ class GraniteSeen:
         if self.lately_K is None:
             return -math.inf
         apart_K = abs(found.probe_degC - found.body_degC - self.lately_apart_K)
-        allowed_K = limits.change_K + limits.share * apart_K + max(0.0, found.probe_risen_K)
+        allowed_K = limits.change_K + limits.share * apart_K + max(0.0, found.probe_risen_K) + found.uncertain_K
         return found.air_degC - found.probe_degC - self.lately_K - allowed_K
 
 

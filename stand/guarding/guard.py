@@ -225,7 +225,7 @@ class Guard:
                 self._warned.discard(index)
             elif index not in self._warned:
                 self._warned.add(index)
-                data: dict[str, object] = {"rule": fault.rule, "action": "warn"}
+                data: dict[str, object] = {"rule": fault.rule, **fault.data}
                 self.hub.publish(Event(now_ns, "warning", f"guard.{fault.rule}", fault.text, data))
         return faults
 

@@ -6,13 +6,15 @@ Each is a pure step, (memory, readings, time) -> (memory, fault), and `rememberi
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.readings import Reading
 from stand.config.guard_section import CoolingConfig, HeaterOffConfig, HeatingConfig
-from stand.fault import Fault, Readings, value_of
+from stand.fault import Fault, Readings, in_doubt, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.surroundings import Surroundings
 
@@ -29,6 +31,25 @@ def remembering(step: Callable[[Memory | None, Readings, int], tuple[Memory | No
         return fault
 
     return rule
+
+
+class Scatter:
+    """How far apart single readings of a channel may be though what it measures does not move: twice the largest second
+    difference of its last dozen readings, which is 0.2 K at full heat and 9 K with a noise of 1 K."""
+
+    def __init__(self, channel: str) -> None:
+        self._channel = channel
+        self._seen: Reading | None = None
+        self._values: deque[float] = deque(maxlen=14)
+
+    def most_K(self, readings: Readings) -> float:
+        """After one more look."""
+        reading = readings.known(self._channel)
+        if reading is not None and reading is not self._seen and not math.isnan(reading.value):
+            self._seen = reading
+            self._values.append(reading.value)
+        last = list(self._values)
+        return 2 * max((abs(c - 2 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)), default=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +115,10 @@ def heater_not_warming(limits: HeatingConfig, regulator: str, permit: str) -> Ru
 
 @dataclass(frozen=True, slots=True)
 class Off:
-    """Heat is off since `since_ns`; the lowest air since it settled, None until then."""
+    """Heat is off since `since_ns`; the lowest air, as `channel` shows it, since it settled, None until then."""
 
     since_ns: int
+    channel: str
     lowest_degC: float | None = None
 
 
@@ -109,6 +131,7 @@ def warming_while_off(
     it above itself: so it must have risen, above the set-point, and above the warmest of `surroundings` that is known.
     """
     mv_heat, set_point, running = (f"{regulator}.{quantity}" for quantity in ("mv_heat", "sp", "running"))
+    scatter = {channel: Scatter(channel) for channel in (air, f"{regulator}.pv")}
 
     def is_heat(readings: Readings, air_degC: float, around_degC: tuple[float, ...]) -> bool:
         if value_of(readings, running) == 1 and air_degC <= value_of(readings, set_point):
@@ -118,17 +141,19 @@ def warming_while_off(
 
     def step(last: Off | None, readings: Readings, now_ns: int) -> tuple[Off | None, Fault | None]:
         around_degC = surroundings(readings, now_ns)  # at each look, for one that follows the air
+        scatters_K = {channel: each.most_K(readings) for channel, each in scatter.items()}
         if not (value_of(readings, mv_heat) <= 0 or value_of(readings, permit) == 0):
             return None, None
-        air_degC = value_of(readings, air)
-        if last is None:
-            return Off(now_ns), None
+        channel = next((each for each in scatter if not in_doubt(readings, each)), air)
+        air_degC = value_of(readings, channel)
+        if last is None or last.channel != channel:
+            return Off(now_ns, channel), None
         if math.isnan(air_degC) or now_ns - last.since_ns < seconds_ns(limits.settle_s):
             return last, None
         lowest_degC = air_degC if last.lowest_degC is None else min(last.lowest_degC, air_degC)
-        state = Off(last.since_ns, lowest_degC)
-        if air_degC - lowest_degC >= limits.rise_K and is_heat(readings, air_degC, around_degC):
-            text = f"{air} has risen from {lowest_degC:.2f} to {air_degC:.2f} degC with the heater off"
+        state = Off(last.since_ns, channel, lowest_degC)
+        if air_degC - lowest_degC >= limits.rise_K + scatters_K[channel] and is_heat(readings, air_degC, around_degC):
+            text = f"{channel} has risen from {lowest_degC:.2f} to {air_degC:.2f} degC with the heater off"
             return state, Fault("warming_while_off", text)
         return state, None
 
@@ -137,10 +162,10 @@ def warming_while_off(
 
 @dataclass(frozen=True, slots=True)
 class CompressorRun:
-    """The compressor has run without heat since `since_ns`, when the air was at `air_degC`."""
+    """The compressor has run without heat since `since_ns`, when the air was at these, as both probes show it."""
 
     since_ns: int
-    air_degC: float
+    air_degC: tuple[float, float]
 
 
 def cooling_in_vain(
@@ -159,8 +184,11 @@ def cooling_in_vain(
         cools = value_of(readings, compressor) == 1 and value_of(readings, mv_heat) <= 0
         if not (cools and is_alone):
             return None, None
-        if last is None or air_degC <= last.air_degC - limits.fall_K:
-            return CompressorRun(now_ns, air_degC), None
+        both_degC = (air_degC, value_of(readings, f"{regulator}.pv"))
+        if last is None or any(
+            now <= before - limits.fall_K for now, before in zip(both_degC, last.air_degC, strict=True)
+        ):
+            return CompressorRun(now_ns, both_degC), None
         if now_ns - last.since_ns < seconds_ns(limits.window_s):
             return last, None
         text = (
@@ -180,33 +208,21 @@ class Constant:
     other: float
 
 
-def stuck(channel: str, after_s: float) -> Rule:
-    """`channel` has been exactly constant for `after_s`: a converter that works is noisier than that."""
-
-    def step(last: Constant | None, readings: Readings, now_ns: int) -> tuple[Constant | None, Fault | None]:
-        value = value_of(readings, channel)
-        if last is None or value != last.value:
-            return Constant(value, now_ns, 0.0), None
-        if now_ns - last.since_ns < seconds_ns(after_s):
-            return last, None
-        return last, Fault("sensor_stuck", f"{channel} has been exactly {value} for {after_s:g} s")
-
-    return remembering(step)
-
-
 def stuck_while_other_moves(channel: str, other: str, moved_K: float, after_s: float) -> Rule:
-    """`channel` has been exactly constant for at least `after_s`, in which `other`, in the same air, went `moved_K`.
+    """`channel` has been exactly constant for at least `after_s`, in which `other`, in the same air, went `moved_K`
+    beyond its scatter; one that is in doubt goes nowhere.
 
     The regulator shows 0.1 K and holds that for an hour, while its output goes from one end to the other to do so:
     neither a constant value nor an output that moves proves a stuck probe, a second sensor does.
     """
+    scatter = Scatter(other)
 
     def step(last: Constant | None, readings: Readings, now_ns: int) -> tuple[Constant | None, Fault | None]:
-        value, other_value = value_of(readings, channel), value_of(readings, other)
-        if last is None or value != last.value:
+        value, other_value, scatter_K = value_of(readings, channel), value_of(readings, other), scatter.most_K(readings)
+        if last is None or value != last.value or in_doubt(readings, other):
             return Constant(value, now_ns, other_value), None
         went_K = abs(other_value - last.other)
-        if now_ns - last.since_ns < seconds_ns(after_s) or not went_K >= moved_K:
+        if now_ns - last.since_ns < seconds_ns(after_s) or not went_K >= moved_K + scatter_K:
             return last, None
         return last, Fault("sensor_stuck", f"{channel} stays at {value} while {other} went by {went_K:.2f} K")
 

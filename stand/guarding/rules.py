@@ -6,16 +6,18 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from experiments.steps import Capture
 from foundation.items import Event, Item, StepMark, StepState
 from stand.config.dew import dew_point_degC
 from stand.config.stand_config import StandConfig
 from stand.fault import Action, Readings, value_of
 from stand.gate import OPERATOR
+from stand.guarding.channels import LEAST_LAG_S, Nature
 from stand.guarding.drifting import drifting
 from stand.guarding.felt_air import camera_feels, granite_feels
 from stand.guarding.first_heat import first_heat
-from stand.guarding.frozen import frozen, stale_by_air
+from stand.guarding.frozen import frozen
 from stand.guarding.heat_given import heat_not_felt, too_much_heat
 from stand.guarding.interlocks import (
     Recording,
@@ -39,16 +41,15 @@ from stand.guarding.interlocks import (
     stopped_while_permitted,
     trustworthy,
 )
-from stand.guarding.jumps import jumped
 from stand.guarding.needed_output import output_not_as_needed
 from stand.guarding.plausibility import (
     cooling_in_vain,
     heater_not_warming,
-    stuck,
     stuck_while_other_moves,
     warming_while_off,
 )
 from stand.guarding.surroundings import Following, Surroundings, measured, together
+from stand.guarding.suspects import Witnesses, telling
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",
@@ -59,6 +60,8 @@ PV, AIR, GRANITE, LABORATORY = (
 RUNNING, PERMIT, COMPRESSOR = "regulator.running", "relays.heater_enable", "relays.compressor"
 FLAP, SET_POINT = "flap.position", "regulator.sp"
 _PV_K = 0.1  # that a regulator shows
+_OUTSIDE_K = 40.0  # beyond the set-points no regulator's probe can be
+_CAMERA_DEGC = (-40.0, 120.0)  # as its driver takes them
 _CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
 _DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
 
@@ -107,12 +110,13 @@ def vital(config: StandConfig) -> tuple[str, ...]:
 def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
     """Every rule with the configured limits. Abort where the stand's temperature is not known or not controlled: that
     ends a night. Hold where an operator can put it right and the night is worth continuing."""
+    seen = witnesses(config)
     return (
         *_temperatures(config),
-        *_heat(config),
-        *_sensors(config),
+        *_heat(config, seen),
+        *_sensors(config, seen),
         *_drifts(config),
-        *_independent(config),
+        *_independent(config, seen),
         *_operations(config, announced),
         *_contacts(config),
         *_dew(config),
@@ -138,36 +142,54 @@ def _temperatures(config: StandConfig) -> tuple[Watch, ...]:
     )
 
 
-def _heat(config: StandConfig) -> tuple[Watch, ...]:
+def _heat(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
     """Heat that does not come, comes unasked, or is held back. The first may be a detached sensor, the second is out
     of control; a relay that does not close or answer, or a compressor that does not cool, can be put right."""
     limits = config.guard
     return (
         Watch(heater_not_warming(limits.heating, "regulator", PERMIT)),
-        Watch(warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, _surroundings(config))),
+        Watch(
+            telling(
+                warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, _surroundings(config)),
+                (AIR, PV),
+                seen,
+                compares=False,
+            )
+        ),
         Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, _surroundings(config)), action="hold"),
         Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
         Watch(trustworthy(PERMIT, limits.keys_s), limits.keys_s, "hold"),
     )
 
 
-def _sensors(config: StandConfig) -> tuple[Watch, ...]:
-    """Which of two sensors that disagree is wrong is not known. A thermometer without noise is suspicious, no more."""
+def witnesses(config: StandConfig) -> Witnesses:
+    """What shows which of two channels moved unlike the rest."""
+    chamber = config.chamber
+    bodies = dict.fromkeys(granite(config), chamber.granite_lag_s)
+    cameras = {f"{name}.temperature": chamber.camera_lag_s for name in config.cameras}
+    in_air = (*((PV,) if _has_probe(config) else ()), AIR, *safety_thermometers(config))
+    return Witnesses(in_air, bodies | cameras, chamber, ("regulator", PERMIT), (FLAP,), (SET_POINT, COMPRESSOR))
+
+
+def _has_probe(config: StandConfig) -> bool:
+    """A regulator of our own has none: it shows what its thermometer does."""
+    return not isinstance(config.regulator, SoftwareRegulatorSettings)
+
+
+def _sensors(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
+    """Of two sensors that disagree each may be wrong: the others say which."""
     limits = config.guard.sensors
+
+    def apart(channel: str, most_K: float) -> Rule:
+        return telling(disagreement(channel, AIR, most_K), (channel, AIR), seen)
+
+    stays = stuck_while_other_moves(PV, AIR, limits.air_moves_K, limits.pv_stuck_after_s)
     return (
-        Watch(disagreement(PV, AIR, limits.warn_K), limits.warn_after_s, "warn"),
-        Watch(disagreement(PV, AIR, limits.trip_K), limits.trip_after_s),
+        Watch(apart(PV, limits.warn_K), limits.warn_after_s, "warn"),
+        Watch(apart(PV, limits.trip_K), limits.trip_after_s),
         # Where a safety thermometer sits is the laboratory's choice, but one that reads low guards nothing.
-        *(
-            Watch(disagreement(each, AIR, limits.warn_K), limits.warn_after_s, "warn")
-            for each in safety_thermometers(config)
-        ),
-        Watch(stuck_while_other_moves(PV, AIR, limits.air_moves_K, limits.pv_stuck_after_s), action="hold"),
-        *(Watch(stuck(f"thermometers.{name}", limits.stuck_after_s), action="warn") for name in config.sensors),
-        *(
-            Watch(jumped(f"thermometers.{name}", limits.jump_K, limits.jump_within_s), action="warn")
-            for name in config.sensors
-        ),
+        *(Watch(apart(each, limits.warn_K), limits.warn_after_s, "warn") for each in safety_thermometers(config)),
+        Watch(telling(stays, (PV, AIR), seen), action="hold"),
     )
 
 
@@ -179,11 +201,14 @@ def _drifts(config: StandConfig) -> tuple[Watch, ...]:
     if config.regulator_unit is not None:
         others[PV] = limit_K + _PV_K
     return tuple(
-        Watch(drifting(AIR, other, SET_POINT, same, most_K), action="warn") for other, most_K in others.items()
+        Watch(
+            drifting((AIR, other), SET_POINT, same, most_K, [each for each in others if each != other]), action="warn"
+        )
+        for other, most_K in others.items()
     )
 
 
-def _independent(config: StandConfig) -> tuple[Watch, ...]:
+def _independent(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
     """Looks that hold when both probes are wrong alike: heat that was given, and what else stands in that air. Abort,
     for its temperature is unknown; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
     found before anything is warm. The camera's own temperature is not required: one that is stale is a warning."""
@@ -194,13 +219,13 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
         Watch(too_much_heat(limits.heat_max_Wh_per_h, chamber.heater_W, "regulator", PERMIT)),
         *(Watch(heat_not_felt(limits.heat_felt, chamber, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
         *(
-            Watch(granite_feels(feels, chamber.granite_lag_s, body, probe))
+            Watch(telling(granite_feels(feels, chamber.granite_lag_s, body, probe), (body, probe), seen))
             for body in granite(config)
             for probe in (PV, AIR)
         ),
         *(
-            Watch(camera_feels(limits.camera_feels, chamber.camera_lag_s, f"{name}.temperature", probe))
-            for name in config.cameras
+            Watch(telling(camera_feels(limits.camera_feels, chamber.camera_lag_s, body, probe), (body, probe), seen))
+            for body in (f"{name}.temperature" for name in config.cameras)
             for probe in (AIR, PV)
         ),
         Watch(output_not_as_needed(limits.needed_output, "regulator", PERMIT, COMPRESSOR, FLAP)),
@@ -208,7 +233,6 @@ def _independent(config: StandConfig) -> tuple[Watch, ...]:
             Watch(frozen(channel, module, frost.step_K, frost.after_s, "regulator"), action="hold")
             for channel in (AIR, *granite(config))
         ),
-        *(Watch(camera_stale(config, name), action="warn") for name in config.cameras),
         Watch(first_heat(limits.first_heat, AIR, "regulator", PERMIT), action="hold"),
     )
 
@@ -221,10 +245,32 @@ def _surroundings(config: StandConfig) -> Surroundings:
     return together(found, Following(AIR, config.chamber.granite_lag_s, config.limits.chamber_degC[1]))
 
 
-def camera_stale(config: StandConfig, name: str) -> Rule:
-    """A frozen temperature of the camera of that name: a warning, and recorded as STALE."""
-    frost = config.guard.frozen
-    return stale_by_air(f"{name}.temperature", AIR, frost.air_moves_K, frost.camera_after_s)
+def natures(config: StandConfig) -> dict[str, Nature]:
+    """Every temperature that a model or a rule uses, and what is known of it beforehand. That of a regulator of our own
+    is its thermometer's."""
+    chamber, (low_degC, high_degC) = config.chamber, config.limits.chamber_degC
+    has_probe = _has_probe(config)
+    followed = {
+        "air": PV if has_probe else "",
+        "granite_inside": AIR,
+        **{name: AIR for name, each in config.sensors.items() if each.is_safety},
+    }
+    lags_s = {"granite_inside": chamber.granite_lag_s, "granite_outside": chamber.granite_lag_s}
+    return {
+        **({PV: Nature((low_degC - _OUTSIDE_K, high_degC + _OUTSIDE_K), follows=AIR)} if has_probe else {}),
+        **{
+            f"thermometers.{name}": Nature(each.plausible_degC, lags_s.get(name, LEAST_LAG_S), followed.get(name, ""))
+            for name, each in config.sensors.items()
+        },
+        **{f"{name}.temperature": Nature(each.calibration.plausible_degC) for name, each in config.probes.items()},
+        **{
+            f"{name}.temperature": Nature(
+                _CAMERA_DEGC, chamber.camera_lag_s, AIR, each.self_heating_K or (0.0, math.inf)
+            )
+            for name, each in config.cameras.items()
+            if each.has_temperature
+        },
+    }
 
 
 def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:

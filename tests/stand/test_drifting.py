@@ -23,7 +23,7 @@ def reported(
     is_bad: Callable[[float], bool] = lambda hour: False,
 ) -> dict[str, float]:
     """What the rule says first of each kind, and after how many hours; with 3 mK of noise."""
-    hub, rule, chance = Hub(), drifting(AIR, OTHER, SP, (FLAP,), limit_K=0.08), random.Random(3)
+    hub, rule, chance = Hub(), drifting((AIR, OTHER), SP, (FLAP,), limit_K=0.08), random.Random(3)
     found: dict[str, float] = {}
     for number in range(round(hours * HOUR_S / STEP_S)):
         hour, now_ns = number * STEP_S / HOUR_S, seconds_ns(number * STEP_S)

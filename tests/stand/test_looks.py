@@ -17,7 +17,7 @@ from stand.config.chamber_section import (
 )
 from stand.guarding.felt_air import camera_feels, granite_feels
 from stand.guarding.first_heat import first_heat
-from stand.guarding.frozen import frozen, stale_by_air
+from stand.guarding.frozen import frozen
 from stand.guarding.heat_given import heat_not_felt, too_much_heat
 from stand.guarding.interlocks import Rule
 from stand.guarding.needed_output import output_not_as_needed
@@ -167,22 +167,6 @@ def test_a_fine_thermometer_without_noise_is_frozen_only_while_the_output_works(
     idle = {"regulator_mv_heat": constant(0.0), "thermometers_granite_inside": noisy(0.003)}
     assert Feed(rule()).run(900, **idle) is None
     assert Feed(rule()).run(900, thermometers_air=noisy(0.003)) is None
-
-
-def test_a_camera_temperature_that_does_not_follow_the_air_is_stale():
-    feed = Feed(stale_by_air(CAMERA, AIR, 3.0, 600))
-    assert feed.run(7200) is None  # at rest it may stand still for hours
-    assert feed.run(900, thermometers_air=lambda s: 40 + s / 50) == 150 + 600
-
-
-def test_a_camera_temperature_in_coarse_steps_must_be_left_behind_by_three_of_them():
-    feed = Feed(stale_by_air(CAMERA, AIR, 3.0, 600))
-    assert feed.run(60, camera_temperature=lambda s: 60.0 if s < 30 else 62.0) is None
-    assert feed.run(1500, thermometers_air=lambda s: min(45.5, 40 + s / 50), camera_temperature=constant(62.0)) is None
-    feed = Feed(stale_by_air(CAMERA, AIR, 3.0, 600))
-    assert feed.run(60, camera_temperature=lambda s: 60.0 if s < 30 else 62.0) is None
-    rising = {"thermometers_air": lambda s: 40 + s / 50, "camera_temperature": constant(62.0)}
-    assert feed.run(1500, **rising) == 300 + 600
 
 
 def test_the_first_heat_must_reach_both_probes():
