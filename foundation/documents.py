@@ -108,7 +108,8 @@ def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
         fault = error.errors()[0]
         # What a file of another kind lacks is no news to a reader; what is wrong inside of one of this kind is.
         where, kind_of_fault = path_text(fault["loc"]), fault["type"]
-        more = "" if kind_of_fault.startswith("union_tag") or not where else f" ({where}: {fault['msg']})"
+        place = f"{where}: " if where else ""  # what concerns the whole file has none
+        more = "" if kind_of_fault.startswith("union_tag") else f" ({place}{fault['msg']})"
         raise SessionError(f"{path}: not {what} of this program{more}") from error
     except ValueError as error:
         raise SessionError(f"{path}: not {what} of this program ({error})") from error
