@@ -126,14 +126,17 @@ WantedBy=multi-user.target
 
 
 def rules(user: str) -> str:
-    """The flap's USB controller and the stages' serial ports belong to the user; stages keep a name of their own."""
-    return f"""# The flap: Pololu Jrk, by USB
-SUBSYSTEM=="usb", ATTR{{idVendor}}=="1ffb", OWNER="{user}", MODE="0660"
+    """The flap's USB controller and the stages' serial ports belong to the user; stages keep a name of their own.
+    ModemManager, which asks each new serial port for a modem by AT commands, leaves them alone."""
+    ignored = 'ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"'
+    return f"""# ID_MM_...: ModemManager is not to look for modems by sending AT commands
+# The flap: Pololu Jrk, by USB
+SUBSYSTEM=="usb", ATTR{{idVendor}}=="1ffb", OWNER="{user}", MODE="0660", {ignored}
 # Stages: XIMC controllers, as /dev/ximc/SERIAL (hexadecimal)
 SUBSYSTEM=="tty", ATTRS{{idVendor}}=="1cbe", ATTRS{{idProduct}}=="0007", OWNER="{user}", MODE="0660", \\
-  SYMLINK+="ximc/%s{{serial}}"
+  SYMLINK+="ximc/%s{{serial}}", {ignored}
 # Serial adapters of the Modbus bus
-SUBSYSTEM=="tty", SUBSYSTEMS=="usb", OWNER="{user}", MODE="0660"
+SUBSYSTEM=="tty", SUBSYSTEMS=="usb", OWNER="{user}", MODE="0660", {ignored}
 """
 
 

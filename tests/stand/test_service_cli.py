@@ -40,6 +40,9 @@ def test_the_unit_starts_the_daemon_and_gives_it_time_to_make_safe(tmp_path: Pat
     rules = (tmp_path / "etc/udev/rules.d/60-thermostand.rules").read_text()
     assert 'ATTR{idVendor}=="1ffb", OWNER="operator"' in rules
     assert 'SYMLINK+="ximc/%s{serial}"' in rules
+    lines = [line for line in rules.replace("\\\n", "").splitlines() if not line.startswith("#")]
+    assert len(lines) == 3
+    assert all('ENV{ID_MM_DEVICE_IGNORE}="1"' in line for line in lines)  # ModemManager sends no AT commands there
 
 
 def test_the_unit_may_do_little_and_systemd_reads_it(tmp_path: Path):
