@@ -86,9 +86,7 @@ async def test_a_soak_with_a_cold_camera_is_not_credited(tmp_path: Path, order: 
     assert powered[powered_ns > restarts[0] + 60 * NS_PER_S].min() == 1
 
 
-def test_after_a_power_cut_the_camera_is_soaked_again(
-    tmp_path: Path, order: Callable[..., Order]
-):
+def test_after_a_power_cut_the_camera_is_soaked_again(tmp_path: Path, order: Callable[..., Order]):
     """The laboratory that a run is resumed in has no camera on: its supply is found off."""
     daemon = Daemon(order(RECIPE), tmp_path / "out")
     assert daemon.lives_for(3, "Frame")  # reference and first set-point are settled
