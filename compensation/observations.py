@@ -6,6 +6,7 @@ Pixels as in markers/detection.py: x = column = I to the right, y = row = J down
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ from experiments.steps import Role
 from foundation.documents import parse_document, yaml_data
 from foundation.errors import ConfigError, SessionError
 from foundation.progress import Report, unwatched
-from foundation.readings import Frame
+from foundation.readings import TEMPERATURE_IN_DOUBT, Frame
 from markers.noise import Noise, estimate_noise
 from markers.target import Target
 from recording.format.utc_offsets import UtcOffsets
@@ -107,6 +108,11 @@ class Observations:
         """How many usable frames there are of each role, as in `20 reference, 12 other`."""
         counts = {role: int(self.of(role).sum()) for role in Role}
         return ", ".join(f"{count} {role}" for role, count in counts.items() if count) or "none"
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """How many frames cannot be used, by the reason."""
+        return dict(Counter(reason for reason in self.reasons if reason))
 
     def of(self, *roles: str) -> Mask:
         """(F,): usable frames taken for one of these purposes."""
@@ -219,7 +225,7 @@ def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -
     known = session.frames_table()
     own = np.flatnonzero(~np.isin(known.time_ns, list(others_ns(session))))
     camera_degC, step_id = known.camera_degC[own], known.step_id[own]
-    reasons = _reasons(found, first, camera_degC, known.superseded[own])
+    reasons = _reasons(found, first, camera_degC, known.superseded[own], known.flags[own])
     purposes = [_purpose(role, degC) for role, degC in zip(known.role[own], known.chamber_degC[own], strict=True)]
     unusable = (found.flags != 0) | np.array([bool(reason) for reason in reasons])[:, None]
     image = session.frame(int(own[first])).image
@@ -244,18 +250,22 @@ def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -
     )
 
 
-def _reasons(found: FoundMarkers, first: int, camera_degC: Float, superseded: NDArray[np.bool_]) -> tuple[str, ...]:
+def _reasons(
+    found: FoundMarkers, first: int, camera_degC: Float, superseded: NDArray[np.bool_], flags: NDArray[np.str_]
+) -> tuple[str, ...]:
     """Why each frame cannot be used, "" when it can."""
     width, height = found.size_px[first].tolist()
-    columns = (found.size_px.tolist(), found.reason.tolist(), camera_degC.tolist(), superseded.tolist())
+    columns = (found.size_px.tolist(), found.reason.tolist(), camera_degC.tolist(), superseded.tolist(), flags.tolist())
     reasons: list[str] = []
-    for size_px, reason, degC, is_restarted in zip(*columns, strict=True):
+    for size_px, reason, degC, is_restarted, flagged in zip(*columns, strict=True):
         if is_restarted:
             reason = "its capture was restarted"
         elif size_px != [width, height]:
             reason = f"the image has {size_px[0]} x {size_px[1]} pixels, the session's {width} x {height}"
         elif not reason and math.isnan(degC):
             reason = "the camera's temperature is unknown"
+        elif not reason and TEMPERATURE_IN_DOUBT in flagged.split(","):
+            reason = "the camera's temperature is in doubt"
         reasons.append(reason)
     return tuple(reasons)
 

@@ -54,6 +54,10 @@ def bad_reading(channel: str, unit: str, time_ns: int, reason: str, cause: Cause
     return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason, cause)
 
 
+TEMPERATURE_IN_DOUBT = "temperature_in_doubt"
+"""The flag of a frame whose camera temperature is not to be believed."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One image and what belongs to it.
@@ -63,7 +67,8 @@ class Frame:
     block_id: own 64-bit count of frames of this device since it was opened, gaps included. camera_ticks: the
     camera's own time stamp, ns. dropped: frames lost since the previous one. step_id: the plan's step that asked
     for it, "" when none did. windows: x, y, width, height of the parts of the image that were recorded, px, shape
-    (n, 4), the rest is filled; None when the whole image is there.
+    (n, 4), the rest is filled; None when the whole image is there. flags: why it is to be left out of fits, in words of
+    letters and _, such as TEMPERATURE_IN_DOUBT.
     """
 
     channel: str
@@ -77,3 +82,4 @@ class Frame:
     dropped: int = 0
     step_id: str = ""
     windows: NDArray[np.int32] | None = None
+    flags: tuple[str, ...] = ()

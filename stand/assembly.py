@@ -191,6 +191,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     if isinstance(regulator, SoftwareRegulator):
         regulator.permitted = lambda: stand.chamber.permits.gives
     check = ChannelCheck(natures(config), config.guard.sensors, config.guard.frozen, hub.publish)
+    stand.imaging.doubt_of = check.doubt_of
     return Assembly(config, hub, clock, bus, devices, stand, notifier, check)
 
 

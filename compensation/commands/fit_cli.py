@@ -95,8 +95,9 @@ def fit(
     stepped += [] if repeats is None else [repeats.text]
     scored = f"what it gains is not known: {unscored}" if evaluation is None else table(evaluation)
     scores = {"not_scored": unscored} if evaluation is None else _scores(evaluation)
-    lines = [f"{model.form}: {model.title}", *stepped, scored]
-    show({**data, "unrepeated": named, "between_nights": repeats, **scores}, lines)
+    left_out = [f"{count} frames are left out: {reason}" for reason, count in observations.left_out.items()]
+    lines = [f"{model.form}: {model.title}", *left_out, *stepped, scored]
+    show({**data, "left_out": observations.left_out, "unrepeated": named, "between_nights": repeats, **scores}, lines)
 
 
 def _scored(model: DriftModel, observations: Observations) -> tuple[Evaluation | None, str]:

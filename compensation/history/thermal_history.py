@@ -37,7 +37,7 @@ _AMBIENT, _POWER = "thermometers.air", "relays.camera_power"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class History:
-    """One session's record: instants, ns, ascending, and values; without BAD readings.
+    """One session's record: instants, ns, ascending, and values; without readings that are BAD or in doubt.
 
     ambient_degC: of the air near the camera. powered: 0 or 1, until the next instant. camera_degC: its own reading,
     in steps of resolution_K (0: none), refined within them.
@@ -113,7 +113,7 @@ def damped_least_squares(terms: Float, values: Float, ridge: float = _SHAPE_RIDG
 
 def _good(session: Session, channel: str) -> tuple[TimesNs, Float]:
     try:
-        times_ns, values = session.readings(channel)
+        times_ns, values = session.believed(channel)
     except SessionError:
         return np.empty(0, np.int64), np.empty(0)
     good = np.isfinite(values)

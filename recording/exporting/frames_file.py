@@ -18,6 +18,7 @@ _FIRST = (
     Column("superseded", "word"),
     Column("set_point_degC", "value"),
     Column("camera_temperature_degC", "value"),
+    Column("flags", "word"),
 )
 
 
@@ -41,6 +42,7 @@ def frames_rows(session: Session, file_of: Sequence[str] | None) -> tuple[tuple[
                 "yes" if table.superseded[place] else "no",
                 float(table.chamber_degC[place]),
                 float(table.camera_degC[place]),
+                str(table.flags[place]),
                 *stand.at(time_ns),
                 *(float(column[place]) for column in table.positions.values()),
             )

@@ -27,6 +27,7 @@ SIDECAR_COLUMNS = (
     Column("camera_ticks_ns", "count"),
     Column("dropped", "count"),
     Column("step_id", "word"),
+    Column("flags", "word"),
 )
 
 
@@ -35,7 +36,7 @@ def frame_facts(file: str, image: RecordedImage, utc: UtcOffsets) -> tuple[Cell,
     rest is empty; its block id is then the 32 bits that were recorded with the image."""
     time_ns, utc_ns, meta = image.time_ns, utc.utc_ns(image.time_ns), image.meta
     if meta is None:
-        return (file, utc_ns, time_ns, math.nan, math.nan, math.nan, None, image.sequence, None, None, None)
+        return (file, utc_ns, time_ns, math.nan, math.nan, math.nan, None, image.sequence, None, None, None, None)
     return (
         file,
         utc_ns,
@@ -48,6 +49,7 @@ def frame_facts(file: str, image: RecordedImage, utc: UtcOffsets) -> tuple[Cell,
         meta.camera_ticks,
         meta.dropped,
         meta.step_id,
+        ",".join(meta.flags),
     )
 
 

@@ -32,6 +32,7 @@ META_COLUMNS = (
     Column("gain_dB", "value"),
     Column("camera_temperature_degC", "value"),
     Column("dropped", "count"),
+    Column("flags", "word"),
 )
 _UNIT_WORDS = {"%": "percent", "1": ""}
 
@@ -113,6 +114,7 @@ def _rows(message: Message, quantities: Quantities, utc: UtcOffsets) -> Iterator
             meta.gain_dB,
             meta.camera_degC,
             meta.dropped,
+            ",".join(meta.flags),
         )
     else:
         batch = messages.decode_batch(message.topic, message.data, message.time_ns)

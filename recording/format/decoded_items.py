@@ -148,6 +148,7 @@ def frame_of(recorded: RecordedImage) -> Frame:
         dropped=meta.dropped,
         step_id=meta.step_id,
         windows=image.windows,
+        flags=meta.flags,
     )
 
 

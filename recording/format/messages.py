@@ -122,6 +122,7 @@ _FrameMeta = _plain_class(
         "gain_dB": DOUBLE,
         "camera_degC": DOUBLE,
         "dropped": UINT64,
+        "flags": STRING,  # with a comma between them
     },
 )
 _Step = _plain_class(
@@ -186,7 +187,8 @@ def _reading(
 def encode_frame_meta(frame: Frame) -> bytes:
     """What belongs to a frame, without its image."""
     fields = {name: getattr(frame, name) for name in FrameMeta.__dataclass_fields__}
-    return _FrameMeta(**{**fields, "camera_degC": canonical(frame.camera_degC)}).SerializeToString()
+    fields |= {"camera_degC": canonical(frame.camera_degC), "flags": ",".join(frame.flags)}
+    return _FrameMeta(**fields).SerializeToString()
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,12 +203,15 @@ class FrameMeta:
     gain_dB: float
     camera_degC: float
     dropped: int
+    flags: tuple[str, ...] = ()
 
 
 def decode_frame_meta(data: bytes) -> FrameMeta:
     """The inverse of encode_frame_meta; SessionError when it is not one."""
     message = _parse(CAMERA_META, data)
-    return FrameMeta(**{name: _get(message, name) for name in FrameMeta.__dataclass_fields__})
+    fields: dict[str, Any] = {name: _get(message, name) for name in FrameMeta.__dataclass_fields__}
+    fields["flags"] = tuple(filter(None, fields["flags"].split(",")))
+    return FrameMeta(**fields)
 
 
 def encode_step(mark: StepMark) -> bytes:

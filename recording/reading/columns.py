@@ -54,6 +54,7 @@ class TopicColumns:
         self._single: dict[
             tuple[str, str], list[tuple[int, int, float]]
         ] = {}  # (device, channel) -> number, time, value
+        self.doubted: dict[str, list[int]] = {}  # by channel: the instants, ns, of readings with cause "doubt"
         self.units: dict[str, str] = {}  # by channel, as it was recorded first
         self._count = 0
 
@@ -78,6 +79,8 @@ class TopicColumns:
     def _add_singly(self, batch: Batch) -> None:
         for reading in batch.readings:
             self.units.setdefault(reading.channel, reading.unit)
+            if reading.cause == "doubt":
+                self.doubted.setdefault(reading.channel, []).append(reading.time_ns)
             single = self._single.setdefault((batch.device, reading.channel), [])
             single.append((self._count, reading.time_ns, reading.value))
 

@@ -27,8 +27,10 @@ class FramesTable:
     file: the segment that holds the image, within the session. time_ns: middle of the exposure, int64. camera:
     whose it is, "" when unknown. step_id: the step that took it, role: what for, as the step says, "" when neither
     is known. superseded: whether its capture was begun again after it, so that it does not count. chamber_degC: the
-    step's set-point. camera_degC: the camera's own temperature. air_degC: near the camera, interpolated. positions:
-    of each axis of the table, by its name, in its unit (mm or deg), interpolated. Numbers are NaN when unknown.
+    step's set-point. camera_degC: the camera's own temperature. flags: why it is to be left out of fits
+    (foundation.readings.Frame), with a comma between them, "" when for no reason. air_degC: near the camera,
+    interpolated. positions: of each axis of the table, by its name, in its unit (mm or deg), interpolated. Numbers are
+    NaN when unknown.
     """
 
     file: NDArray[np.str_]
@@ -39,6 +41,7 @@ class FramesTable:
     superseded: NDArray[np.bool_]
     chamber_degC: Float
     camera_degC: Float
+    flags: NDArray[np.str_]
     air_degC: Float
     positions: Mapping[str, Float] = field(default_factory=dict[str, Float])
 
@@ -69,6 +72,7 @@ class FramesTable:
             "superseded",
             "chamber_degC",
             "camera_degC",
+            "flags",
             "air_degC",
         )
         own: dict[str, NDArray[np.generic]] = {name: getattr(self, name) for name in names}
@@ -119,6 +123,7 @@ def frames_table(session: Recorded, files: list[str], times_ns: NDArray[np.int64
         superseded=np.array([is_superseded(time_ns, name, begins_ns) for time_ns, name in named], bool),
         chamber_degC=np.array([_number(steps.get(name, {}).get("chamber_degC")) for name in step_id], np.float64),
         camera_degC=np.array([math.nan if meta is None else meta.camera_degC for meta in metas], np.float64),
+        flags=np.array(["" if meta is None else ",".join(meta.flags) for meta in metas], np.str_),
         air_degC=_at(session, _AIR, times_ns),
         positions={axis: _at(session, f"{axis}.position", times_ns) for axis in _axes(session)},
     )

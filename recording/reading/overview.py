@@ -5,7 +5,7 @@ part of the answer, not a reason to give none.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -54,7 +54,7 @@ class Temperature:
 class Frames:
     """The images. `pixels`: those of the first, as in `2448 x 2048 px, 8 bit`; schema and pixels are "" without any.
     described: descriptions in the telemetry. dropped: frames that the camera or its wire lost, as the descriptions say.
-    lost_by_recorder: frames of which its events say so."""
+    lost_by_recorder: frames of which its events say so. flagged: how many have each flag."""
 
     count: int
     size_bytes: int
@@ -65,6 +65,7 @@ class Frames:
     described: int
     dropped: int
     lost_by_recorder: int
+    flagged: Mapping[str, int] = field(default_factory=dict[str, int])
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +178,7 @@ def _frames(seen: Glance, read: _Reading) -> Frames:
         len(contents.metas),
         sum(meta.dropped for _, meta in contents.metas),
         sum(map(len, reported_blocks(contents.events))),
+        Counter(flag for _, meta in contents.metas for flag in meta.flags),
     )
 
 

@@ -91,6 +91,7 @@ class Session:
         self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
         self._all_columns_read = False
         self._units: dict[str, str] = {}
+        self._doubted: dict[str, list[int]] = {}
         self._places_of: dict[Path, list[FramePlace]] = {}
         self._metas_of: dict[Path, dict[tuple[int, int], bytes]] = {}
 
@@ -151,6 +152,12 @@ class Session:
             raise SessionError(f"{self.path}: has no channel {channel}; there are {', '.join(self.channels())}")
         return found
 
+    def believed(self, channel: str) -> Column:
+        """As `readings`, without those that were recorded in doubt."""
+        times_ns, values = self.readings(channel)
+        kept = ~np.isin(times_ns, self._doubted.get(channel, []))
+        return times_ns[kept], values[kept]
+
     def _all_columns(self) -> dict[str, Column]:
         if not self._all_columns_read:
             self._columns = self._read_columns(None)
@@ -179,6 +186,7 @@ class Session:
                 for name, of_device in topic.columns().items():
                     columns.setdefault(name, {}).update(of_device)
                 self._units |= topic.units
+                self._doubted |= topic.doubted
         return columns
 
     def steps(self) -> list[StepMark]:

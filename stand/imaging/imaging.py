@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +12,7 @@ from foundation.clock import Clock, seconds_ns
 from foundation.errors import Unreachable
 from foundation.hub import Hub
 from foundation.items import Event
-from foundation.readings import Frame
+from foundation.readings import TEMPERATURE_IN_DOUBT, Frame
 from stand.config.stand_config import LEADING
 from stand.gate import CAMERA_LOST, Gate
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
@@ -45,6 +45,7 @@ class Imaging:
         self._hub = hub
         self._clock = clock
         self._moving_flap = asyncio.Lock()  # one command after the other; making safe waits for none
+        self.doubt_of: Callable[[str, float, int], str] = lambda channel, value, time_ns: ""  # of a temperature
         self._without_camera_ns = 0  # how long a lost camera was waited for since its last frame
 
     @property
@@ -98,7 +99,10 @@ class Imaging:
         self._without_camera_ns = 0
         published: dict[str, Frame] = {}
         for frame in frames:
-            published[frame.channel] = replace(frame, step_id=step_id)
+            name, _, _ = frame.channel.partition(".")
+            is_doubted = self.doubt_of(f"{name}.temperature", frame.camera_degC, frame.time_ns)
+            flags = (*frame.flags, TEMPERATURE_IN_DOUBT) if is_doubted else frame.flags
+            published[frame.channel] = replace(frame, step_id=step_id, flags=flags)
             self._hub.publish(published[frame.channel])
         return published
 

@@ -164,6 +164,7 @@ def _lost(frames: Frames) -> str:
         parts.append(f"{frames.dropped} lost by the camera or its wire")
     if frames.lost_by_recorder:
         parts.append(f"{frames.lost_by_recorder} lost by the recorder")
+    parts += [f"{count} flagged {flag}" for flag, count in sorted(frames.flagged.items())]
     if frames.described != frames.count:
         parts.append(f"{frames.described} are described in the telemetry")
     return "".join(f"; {part}" for part in parts)

@@ -1,0 +1,85 @@
+"""A camera that shows a wrong temperature around each capture: what is recorded, said, and left out of a fit."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from compensation.observations import observe
+from foundation.hub import Hub
+from foundation.items import Batch, Item, StepMark, StepState
+from foundation.readings import TEMPERATURE_IN_DOUBT, Quality
+from recording.exporting.frames_file import frames_rows
+from recording.reading.overview import overview
+from recording.reading.session import Session
+from stand.running.order import Order
+from stand.running.run import run_virtual
+from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.test_run_ends import break_now
+
+OFFSET_K = 10.0
+RECIPE = """
+name: doubted
+experiments:
+  - thermal_cycle:
+      table_position: {linear: 2, rotary: 1}
+      equilibrium_s: 300
+      set_points_degC: [30, 24]
+      dwell_s: 300
+      reference_frames: 1
+      frames_per_point: 1
+"""
+
+
+@pytest.fixture(autouse=True)
+def _aravis() -> None:
+    require_aravis()
+
+
+async def test_frames_of_a_camera_that_is_wrong_at_each_capture_say_so(tmp_path: Path, order: Callable[..., Order]):
+    """It is wrong from the begin of each capture but the first on, before any reading has shown it."""
+    ordered, captures = order(RECIPE, camera=WHOLE_SENSOR), list[str]()
+
+    def follow(item: Item) -> None:
+        if not isinstance(item, StepMark) or item.kind != "Capture":
+            return
+        if item.state is StepState.STARTED:
+            captures.append(item.step_id)
+            break_now(ordered, "camera.temperature_offset_K", OFFSET_K if len(captures) > 1 else 0.0)
+        elif len(captures) > 1:
+            break_now(ordered, "camera.temperature_offset_K", 0.0)
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(follow)
+
+    path = await run_virtual(ordered, tmp_path / "out", None, watch)
+    session = Session.open(path)
+    flags = [(meta.step_id != captures[0], meta.flags) for _, meta in session.frame_metas]
+    assert [flag for is_wrong, flag in flags if not is_wrong] == [()]
+    assert {flag for is_wrong, flag in flags if is_wrong} == {(TEMPERATURE_IN_DOUBT,)}
+    count = sum(is_wrong for is_wrong, _ in flags)
+    assert count >= 2
+    assert [frame.flags for frame in session.frames()] == [flag for _, flag in flags]
+    assert Counter(session.frames_table().flags.tolist())[TEMPERATURE_IN_DOUBT] == count
+    assert overview(path).frames.flagged == {TEMPERATURE_IN_DOUBT: count}
+    columns, rows = frames_rows(session, None)
+    place = [column.name for column in columns].index("flags")
+    assert Counter(row[place] for row in rows)[TEMPERATURE_IN_DOUBT] == count
+    said = Counter(event.kind for event in session.events() if "channels" in event.data)
+    assert said == {"guard.sensor_jumped": len(captures) - 1, "sensor_believed": len(captures) - 1}
+    wrong_ns = {
+        each.time_ns
+        for item in session.items()
+        if isinstance(item, Batch)
+        for each in item.readings
+        if each.channel == "camera.temperature" and each.quality is Quality.STALE and each.cause == "doubt"
+    }
+    assert (
+        set(session.readings("camera.temperature")[0].tolist())
+        - set(session.believed("camera.temperature")[0].tolist())
+        == wrong_ns
+    )
+    observed = observe(path)
+    assert Counter(observed.reasons)[""] == 1
+    assert observed.left_out == {"the camera's temperature is in doubt": count}
