@@ -40,6 +40,9 @@ _TOGETHER_S = 15.0  # what moves within this, on other devices, moved with it
 _BACK_S = 1800.0  # for so long a channel must be as far from the one that it follows as it was before it jumped
 _STILL_K = 2.0  # air that stays within this is at rest, as far as a camera notices
 _REST_LAGS = 3.0  # after so many lags in air at rest a camera is at rest, too
+_REST_K, _OWN_REST_LAGS = 1.0, 2.0
+"""A camera that stayed within so much for so many of its configured lags has warmed up: the lag is a guess, and one of
+a hundred drawn nights had a camera three times as slow, still warming up in air at rest."""
 _STEPS_BEHIND, _SLOWER, _FINE_STEP_K, _YOUNG_LAGS = 5.0, 3.0, 0.2, 10.0
 """Steps of a display that a camera must have gone before it counts as stuck, with up to three times its configured lag.
 One coarser than 0.2 K needs more, in proportion, while it may still warm up: of 260 drawn nights one had a camera in
@@ -97,6 +100,8 @@ class _Seen:
     rest_degC: float = math.nan  # of what it follows, at rest since
     rest_ns: int = 0
     rest_K: float = math.nan  # above it, when both were last at rest
+    still_degC: float = math.nan  # where it has stayed itself, since
+    still_ns: int = 0
     doubted: _Doubted | None = None
 
 
@@ -303,8 +308,10 @@ class ChannelCheck:
         return _Doubted(Fault("sensor_stale", text, "warn"), seen.time_ns)
 
     def _is_at_rest(self, seen: _Seen, nature: Nature) -> bool:
-        """A slow body, on for long in air that has not moved for long."""
-        return (seen.time_ns - max(seen.rest_ns, seen.begin_ns)) / NS_PER_S >= _REST_LAGS * nature.lag_s
+        """A slow body, on for long in air that has not moved for long, and still itself."""
+        in_air_s = (seen.time_ns - max(seen.rest_ns, seen.begin_ns)) / NS_PER_S
+        still_s = (seen.time_ns - seen.still_ns) / NS_PER_S
+        return in_air_s >= _REST_LAGS * nature.lag_s and still_s >= _OWN_REST_LAGS * nature.lag_s
 
     def _excess(self, channel: str, seen: _Seen, nature: Nature) -> _Doubted | None:
         """A camera at rest, in air at rest, against what is known of its own heat: stated, and what it was before."""
@@ -414,6 +421,8 @@ def _note(seen: _Seen, value: float, time_ns: int, *, is_poll: bool) -> None:
     step_K = abs(value - seen.value)
     if step_K > _SAME_K:
         seen.step_K = min(seen.step_K, step_K)
+    if not abs(value - seen.still_degC) <= _REST_K + _step_K(seen):  # at first it is NaN
+        seen.still_degC, seen.still_ns = value, time_ns
     seen.value, seen.time_ns = value, time_ns
     seen.recent.append((time_ns, value))
     while (time_ns - seen.recent[0][0]) / NS_PER_S > _WINDOW_S:
