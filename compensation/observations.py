@@ -25,7 +25,7 @@ from experiments.steps import Role
 from foundation.documents import parse_document, yaml_data
 from foundation.errors import ConfigError, SessionError
 from foundation.progress import Report, unwatched
-from foundation.readings import TEMPERATURE_IN_DOUBT, Frame
+from foundation.readings import TEMPERATURE_IN_DOUBT, UNSETTLED, Frame
 from markers.noise import Noise, estimate_noise
 from markers.target import Target
 from recording.format.utc_offsets import UtcOffsets
@@ -266,6 +266,8 @@ def _reasons(
             reason = "the camera's temperature is unknown"
         elif not reason and TEMPERATURE_IN_DOUBT in flagged.split(","):
             reason = "the camera's temperature is in doubt"
+        elif not reason and UNSETTLED in flagged.split(","):
+            reason = "the chamber was not in its band when the soak before it ended"
         reasons.append(reason)
     return tuple(reasons)
 

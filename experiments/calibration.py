@@ -11,12 +11,12 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import Chamber_degC, Linear_mm, MovingTable, Rotary_deg, TablePosition, Wait_s
-from experiments.pieces import frames_at, homes_checked, moved
-from experiments.steps import CloseFlap, Role, Soak, StartChamber, Step, StopChamber
+from experiments.parameters import Chamber_degC, Guaranteed, Linear_mm, MovingTable, Rotary_deg, TablePosition, Wait_s
+from experiments.pieces import frames_at, homes_checked, moved, soak
+from experiments.steps import CloseFlap, Role, StartChamber, Step, StopChamber
 
 
-class Calibration(MovingTable):
+class Calibration(MovingTable, Guaranteed):
     """Parameters of a calibration."""
 
     reference_degC: Chamber_degC = 24.0
@@ -61,7 +61,7 @@ def calibration(parameters: Calibration) -> Iterator[Step]:
     yield StartChamber(reference_degC)
     yield from moved(positions[0])
     yield from homes_checked()
-    yield Soak(parameters.equilibrium_s)
+    yield soak(parameters.equilibrium_s, parameters)
     for position in positions:
         yield from frames_at(parameters, position, parameters.frames_per_position, Role.CALIBRATION, reference_degC)
     yield from homes_checked()

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from experiments.steps import WANTED_STATES, WantedState
+from experiments.steps import SOAK_BAND_K, WANTED_STATES, OnUnsettled, WantedState
 from foundation.documents import Document
 
 COLDEST_degC, WARMEST_degC = -10.0, 70.0  # the paper's chamber, section 2
@@ -30,6 +30,13 @@ class CaptureParameters(Document):
         if self.exposure_s > self.interval_s:
             raise ValueError(f"exposure_s {self.exposure_s} does not fit into interval_s {self.interval_s}")
         return self
+
+
+class Guaranteed(Document):
+    """How near to its set-point the chamber has to be before frames are taken there; see steps.Soak."""
+
+    band_K: float = Field(default=SOAK_BAND_K, ge=0, le=20)
+    unsettled: OnUnsettled = "mark"
 
 
 class StillTable(CaptureParameters):

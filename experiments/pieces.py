@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from experiments.parameters import CaptureParameters, MovingTable, Settled, TablePosition
-from experiments.steps import Capture, CheckHome, CloseFlap, MoveTo, OpenFlap, Role, Soak, SoakUntilSettled, Step
+from experiments.parameters import CaptureParameters, Guaranteed, MovingTable, Settled, TablePosition
+from experiments.steps import (
+    AnySoak,
+    Capture,
+    CheckHome,
+    CloseFlap,
+    MoveTo,
+    OpenFlap,
+    Role,
+    Soak,
+    SoakUntilSettled,
+    Step,
+)
 
 _AXES = ("linear", "rotary")
 
@@ -17,12 +28,22 @@ def frames_through_flap(parameters: CaptureParameters, frames: int, role: Role, 
     yield CloseFlap()
 
 
-def dwell(dwell_s: float, until: Settled | None, exposure_s: float, chamber_degC: float) -> Step:
+def soak(duration_s: float, how: Guaranteed) -> Soak:
+    """A soak at a set-point."""
+    return Soak(duration_s, band_K=how.band_K, unsettled=how.unsettled)
+
+
+def dwell(dwell_s: float, until: Settled | None, how: Guaranteed, exposure_s: float, chamber_degC: float) -> AnySoak:
     """The soak at a set-point: `dwell_s`, or at most that."""
     if until is None:
-        return Soak(dwell_s)
+        return soak(dwell_s, how)
+    return soak_until_settled(dwell_s, until, exposure_s, chamber_degC)
+
+
+def soak_until_settled(max_s: float, until: Settled, exposure_s: float, chamber_degC: float) -> SoakUntilSettled:
+    """The soak at a set-point that takes at most `max_s`."""
     return SoakUntilSettled(
-        max_s=dwell_s,
+        max_s=max_s,
         min_s=until.min_s,
         window_s=until.window_s,
         look_every_s=until.look_every_s,
@@ -49,7 +70,7 @@ def frames_at(
 ) -> Iterator[Step]:
     """The target moved to `position` and at rest there, then its frames."""
     yield from moved(position)
-    yield Soak(parameters.settle_s)
+    yield Soak(parameters.settle_s, band_K=0.0)
     yield from frames_through_flap(parameters, frames, role, chamber_degC)
 
 

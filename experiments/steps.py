@@ -63,11 +63,26 @@ class StopChamber:
     """Stop the regulator and withdraw the permission to heat and cool."""
 
 
+OnUnsettled = Literal["mark", "hold"]
+SOAK_BAND_K = 1.0
+_LAST_PART, _LONGEST_LAST_S, _LIMIT = 1 / 3, 600.0, 2.0  # of a soak's time
+
+
 @dataclass(frozen=True, slots=True)
 class Soak:
-    """Let the camera come to equilibrium for `duration_s` from now."""
+    """Let the camera come to equilibrium: a guaranteed soak of `duration_s`.
+
+    It ends when its time is over and the thermometer that the set-point controls was within `band_K` of it throughout
+    the last `last_s` (by default a third of the time, at most 10 min). Until then it goes on, for `max_s` in all (by
+    default twice its time). Then the run goes on and marks its frames, or with `unsettled: hold` is held.
+    band_K 0: the chamber need not be anywhere; a wait for the table, or along a ramp.
+    """
 
     duration_s: float
+    band_K: float = SOAK_BAND_K
+    last_s: float | None = None
+    max_s: float | None = None
+    unsettled: OnUnsettled = "mark"
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,14 +228,40 @@ Step = (
 AnySoak = Soak | SoakUntilSettled
 
 
+def impossible(soak: Soak) -> str:
+    """Why the soak cannot be guaranteed, as a clause; "" when it can."""
+    if soak.max_s is not None and soak.max_s < soak.duration_s:
+        return f"max_s {soak.max_s:g} is its longest time; it must be at least duration_s {soak.duration_s:g}"
+    if last_part_s(soak) > soak.duration_s:
+        return f"last_s {soak.last_s:g} is its last part; it must be at most duration_s {soak.duration_s:g}"
+    return ""
+
+
 def is_setup(step: Step) -> bool:
     """Whether the step brings about a state, to be restored after an interruption; the others are work, done once."""
     return not isinstance(step, AnySoak | CoolDown | Capture | CheckHome | Prompt | Decide)
 
 
 def longest_s(soak: AnySoak) -> float:
-    """What the soak takes when it is not cut short, s."""
-    return soak.duration_s if isinstance(soak, Soak) else soak.max_s
+    """What the soak takes at the most, s."""
+    if isinstance(soak, SoakUntilSettled):
+        return soak.max_s
+    if soak.band_K == 0.0:
+        return soak.duration_s
+    return max(soak.duration_s, _LIMIT * soak.duration_s if soak.max_s is None else soak.max_s)
+
+
+def band_K_of(soak: AnySoak) -> float:
+    """How near to its set-point the chamber has to be in the soak's last part, K; 0: anywhere."""
+    return soak.band_K if isinstance(soak, Soak) else SOAK_BAND_K
+
+
+def last_part_s(soak: AnySoak) -> float:
+    """For how long before its end the chamber has to be in the soak's band, s."""
+    if isinstance(soak, Soak) and soak.last_s is not None:
+        return soak.last_s
+    stated_s = soak.duration_s if isinstance(soak, Soak) else soak.max_s
+    return min(_LAST_PART * stated_s, _LONGEST_LAST_S)
 
 
 # What a step takes beyond its stated durations, s: flap travel and its confirmation, stage moves, homing and back.
@@ -234,8 +275,10 @@ _CAMERA_EXCESS_K = 20.0  # of a camera that has been on for an hour, over the ai
 def estimate_s(step: Step, camera_boot_s: float) -> float:
     """How long the step is expected to take on the stand's clock, s, with a camera that boots in `camera_boot_s`."""
     match step:
-        case Soak() | SoakUntilSettled():
-            return longest_s(step)
+        case Soak():
+            return step.duration_s
+        case SoakUntilSettled():
+            return step.max_s
         case Capture():
             return (step.frames - 1) * step.interval_s + step.exposure_s
         case OpenFlap() | CloseFlap():
@@ -265,9 +308,10 @@ def kind_of(step: Step) -> str:
 
 
 def parameters_of(step: Step) -> dict[str, object]:
-    """The step's fields as JSON-able values; without those that list nothing, such as a capture's cameras."""
+    """The step's fields as JSON-able values; without those that list nothing, such as a capture's cameras, or leave a
+    default to the step."""
     values = {name: str(value) if isinstance(value, Role) else value for name, value in asdict(step).items()}
-    return {name: value for name, value in values.items() if value != ()}
+    return {name: value for name, value in values.items() if value != () and value is not None}
 
 
 _KINDS: dict[str, type[Step]] = {kind.__name__: kind for kind in get_args(Step)}
@@ -285,9 +329,11 @@ def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
         wrong = "; ".join(f"{path_text(each['loc'])}: {each['msg']}" for each in error.errors())
         raise ConfigError(f"{kind}: {wrong}") from error
     for name, value in asdict(step).items():
-        least = 1 if name == "frames" else 0 if name.endswith("_s") else -math.inf
+        least = 1 if name == "frames" else 0 if name.endswith("_s") or name == "band_K" else -math.inf
         if isinstance(value, int | float) and not least <= value < math.inf:
             raise ConfigError(f"{kind}: {name} is {value}")
+    if isinstance(step, Soak) and (reason := impossible(step)):
+        raise ConfigError(f"{kind}: {reason}")
     return step
 
 
@@ -309,8 +355,15 @@ class PlannedStep:
     step: Step
 
 
+# Plans from before soaks were guaranteed keep their ids, so that a run that was interrupted then can be resumed.
+_NOT_IN_IDS: dict[str, tuple[object, ...]] = {"band_K": (0.0, SOAK_BAND_K), "unsettled": ("mark",)}
+
+
 def number_steps(steps: Iterable[Step], first: int = 0) -> Iterator[PlannedStep]:
     """Give each step its place (from `first`) and its id."""
     for index, step in enumerate(steps, first):
-        text = json.dumps([index, kind_of(step), parameters_of(step)], sort_keys=True)
+        parameters = parameters_of(step)
+        if isinstance(step, Soak):
+            parameters = {name: value for name, value in parameters.items() if value not in _NOT_IN_IDS.get(name, ())}
+        text = json.dumps([index, kind_of(step), parameters], sort_keys=True)
         yield PlannedStep(index, hashlib.sha256(text.encode()).hexdigest()[:12], step)

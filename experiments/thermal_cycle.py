@@ -21,17 +21,18 @@ from experiments.known import MOST_VISITS, Frames, first_decision, fixed_visits
 from experiments.parameters import (
     Chamber_degC,
     FrameCount,
+    Guaranteed,
     Known,
     StillTable,
     UntilSettledOrKnown,
     Wait_s,
     check_until,
 )
-from experiments.pieces import dwell, frames_through_flap, placed
-from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
+from experiments.pieces import dwell, frames_through_flap, placed, soak
+from experiments.steps import SOAK_BAND_K, CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
 
 
-class ThermalCycle(StillTable):
+class ThermalCycle(StillTable, Guaranteed):
     """Parameters of a thermal cycle; temperatures are chamber set-points."""
 
     reference_degC: Chamber_degC = 24.0
@@ -51,6 +52,8 @@ class ThermalCycle(StillTable):
             raise ValueError(f"held_out_degC has {unvisited}, which set_points_degC never visits")
         if self.reference_degC in self.held_out_degC:
             raise ValueError(f"the reference {self.reference_degC} degC cannot be held out")
+        if isinstance(self.until, Known) and (self.band_K, self.unsettled) != (SOAK_BAND_K, "mark"):
+            raise ValueError("band_K and unsettled are not for until: known, whose soaks have the usual band")
         if not isinstance(self.until, Known):
             check_until(self.until, self.dwell_s)
         elif self.visits > MOST_VISITS:
@@ -70,7 +73,7 @@ def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     yield CloseFlap()
     yield from placed(parameters.table_position)
     yield StartChamber(parameters.reference_degC)
-    yield Soak(parameters.equilibrium_s)
+    yield soak(parameters.equilibrium_s, parameters)
     yield from frames_through_flap(parameters, parameters.reference_frames, Role.REFERENCE, parameters.reference_degC)
     if isinstance(parameters.until, Known):
         yield from _deciding(parameters, parameters.until)
@@ -78,7 +81,7 @@ def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     for _ in range(parameters.cycles):
         for chamber_degC in parameters.set_points_degC:
             yield SetTemperature(chamber_degC)
-            yield dwell(parameters.dwell_s, parameters.until, parameters.exposure_s, chamber_degC)
+            yield dwell(parameters.dwell_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
             role = Role.VALIDATION if chamber_degC in parameters.held_out_degC else Role.FIT
             yield from frames_through_flap(parameters, parameters.frames_per_point, role, chamber_degC)
     yield StopChamber()

@@ -13,12 +13,21 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import Chamber_degC, FrameCount, MovingTable, TablePosition, Until, Wait_s, check_until
-from experiments.pieces import dwell, frames_at, homes_checked, moved
-from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
+from experiments.parameters import (
+    Chamber_degC,
+    FrameCount,
+    Guaranteed,
+    MovingTable,
+    TablePosition,
+    Until,
+    Wait_s,
+    check_until,
+)
+from experiments.pieces import dwell, frames_at, homes_checked, moved, soak
+from experiments.steps import CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
 
 
-class Validation(MovingTable):
+class Validation(MovingTable, Guaranteed):
     """Parameters of a validation; temperatures are chamber set-points, the first one is the reference.
 
     positions: V0, V1, ... in order of visit. check_home_every: temperatures between two home checks.
@@ -54,13 +63,13 @@ def validation(parameters: Validation) -> Iterator[Step]:
     yield StartChamber(reference_degC)
     yield from moved(parameters.positions[0])
     yield from homes_checked()
-    yield Soak(parameters.equilibrium_s)
+    yield soak(parameters.equilibrium_s, parameters)
     yield from _poses(parameters, reference_degC, parameters.reference_frames)
     for number, chamber_degC in enumerate(others_degC, start=1):
         if number % parameters.check_home_every == 0:
             yield from homes_checked()
         yield SetTemperature(chamber_degC)
-        yield dwell(parameters.dwell_s, parameters.until, parameters.exposure_s, chamber_degC)
+        yield dwell(parameters.dwell_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
         yield from _poses(parameters, chamber_degC, parameters.frames_per_position)
     yield from homes_checked()
     yield StopChamber()

@@ -13,8 +13,16 @@ from typing import Annotated, Self, cast
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
-from experiments.parameters import CaptureParameters, Chamber_degC, FrameCount, Settled, Wait_s, check_until
-from experiments.pieces import dwell, placed
+from experiments.parameters import (
+    CaptureParameters,
+    Chamber_degC,
+    FrameCount,
+    Guaranteed,
+    Settled,
+    Wait_s,
+    check_until,
+)
+from experiments.pieces import placed, soak_until_settled
 from experiments.steps import (
     Capture,
     CheckHome,
@@ -29,6 +37,7 @@ from experiments.steps import (
     StartChamber,
     Step,
     StopChamber,
+    impossible,
 )
 from foundation.documents import Document
 
@@ -70,6 +79,33 @@ class CaptureEntry(CaptureParameters):
         if self.role is Role.SETTLING:
             raise ValueError("role settling is kept for the looks of soak_until_settled; give another one, or none")
         return self
+
+
+class _Timed(Document):
+    duration_s: Wait_s
+
+
+class SoakEntry(Guaranteed, _Timed):
+    """A guaranteed soak, as the step Soak."""
+
+    last_s: Wait_s | None = None
+    max_s: Wait_s | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if reason := impossible(self.step):
+            raise ValueError(reason)
+        return self
+
+    @property
+    def step(self) -> Soak:
+        """The step."""
+        return Soak(self.duration_s, self.band_K, self.last_s, self.max_s, self.unsettled)
+
+
+def _soak(value: object) -> object:
+    """A number alone is its time, s."""
+    return {"duration_s": value} if isinstance(value, int | float) else value
 
 
 class SoakUntilSettledEntry(Settled):
@@ -157,7 +193,7 @@ class StepEntry(Document):
     set_temperature: Chamber_degC | None = None
     ramp: Ramp | None = None
     stop_chamber: Nothing | None = None
-    soak: Wait_s | None = None
+    soak: Annotated[SoakEntry, BeforeValidator(_soak, json_schema_input_type=Wait_s | SoakEntry)] | None = None
     soak_until_settled: SoakUntilSettledEntry | None = None
     open_flap: Nothing | None = None
     close_flap: Nothing | None = None
@@ -207,7 +243,7 @@ def written_steps(
                     raise PlanError(here, "a ramp begins at a set-point; give start_chamber before it")
                 for degC, soak_s in ramp.set_points(at_degC):
                     yield Written(here, SetTemperature(degC))
-                    yield Written(here, Soak(soak_s))
+                    yield Written(here, Soak(soak_s, band_K=0.0))
                     at_degC = yield from written_steps(ramp.steps, (*here, "steps"), degC)
             case value:
                 for step in _steps(entry.name, value, here, at_degC):
@@ -229,10 +265,10 @@ def _steps(name: str, value: object, place: Place, at_degC: float | None) -> Ite
             return (StartChamber(degC),)
         case "set_temperature", float(degC):
             return (SetTemperature(degC),)
-        case "soak", float(duration_s):
-            return (Soak(duration_s),)
+        case _, SoakEntry() as soak:
+            return (soak.step,)
         case _, SoakUntilSettledEntry(max_s=max_s, exposure_s=exposure_s) as until:
-            return (dwell(max_s, until, exposure_s, _known(at_degC, place, "start_chamber before it")),)
+            return (soak_until_settled(max_s, until, exposure_s, _known(at_degC, place, "start_chamber before it")),)
         case _, CaptureEntry() as capture:
             degC = at_degC if capture.chamber_degC is None else capture.chamber_degC
             degC = _known(degC, place, "start_chamber before it, or chamber_degC")

@@ -56,6 +56,8 @@ def bad_reading(channel: str, unit: str, time_ns: int, reason: str, cause: Cause
 
 TEMPERATURE_IN_DOUBT = "temperature_in_doubt"
 """The flag of a frame whose camera temperature is not to be believed."""
+UNSETTLED = "unsettled"
+"""The flag of a frame before which the chamber was not in its band at the end of the soak."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -84,7 +84,7 @@ def _fault(step: object) -> str:
         return f"is no step of experiments.steps but {type(step).__name__}"
     for name in [field.name for field in fields(step)]:
         value = getattr(step, name)
-        if name in ("axis", "text", "role", "on"):
+        if name in ("axis", "text", "role", "on", "unsettled"):
             continue
         if name == "cameras":
             is_right = isinstance(value, tuple) and all(
@@ -93,7 +93,9 @@ def _fault(step: object) -> str:
         else:
             least = _AT_LEAST.get(name, 0.0 if name.endswith("_s") else -math.inf)
             numbers = cast("tuple[object, ...]", value) if isinstance(value, tuple) else (value,)
-            is_right = all(isinstance(each, float | int) and least <= each < math.inf for each in numbers)
+            is_right = all(
+                isinstance(each, float | int) and least <= each < math.inf for each in numbers if each is not None
+            )
         if not is_right:
             return f"({kind_of(step)}) has {name} {value!r}"
     return ""

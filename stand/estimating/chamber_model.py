@@ -67,10 +67,10 @@ class ChamberModel(Document):
     cooling_ramps: int = Field(default=0, ge=0)
     camera_ramps: int = Field(default=0, ge=0)
 
-    def arrival_s(self, from_degC: float, to_degC: float) -> float:
-        """From the step of the set-point until the air is in its band (BAND_K), s."""
+    def arrival_s(self, from_degC: float, to_degC: float, level_K: float = BAND_K) -> float:
+        """From the step of the set-point until the air is within `level_K` of it, s."""
         response = self.heating if to_degC > from_degC else self.cooling
-        return response.arrival_s(to_degC - from_degC)
+        return response.arrival_s(to_degC - from_degC, level_K)
 
     def settled_s(self, from_degC: float, to_degC: float) -> float:
         """Until the camera has followed for two time constants after that, s; 0 when the air need not move."""

@@ -22,11 +22,14 @@ from experiments.steps import (
     OpenFlap,
     PowerCamera,
     SetTemperature,
+    Soak,
     SoakUntilSettled,
     StartChamber,
     Step,
     estimate_s,
     kind_of,
+    last_part_s,
+    longest_s,
 )
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
@@ -55,14 +58,15 @@ def move_s(stage: StageProfile, steps: float) -> float:
 @dataclass(frozen=True, slots=True)
 class Situation:
     """What a step finds: the flap, whether the plan has had the camera on (before that its temperature is unknown),
-    where each axis stands (mm or deg; one that is missing is not homed), and the last two set-points: a soak is taken
-    to begin when the chamber sets off from the one to the other."""
+    where each axis stands (mm or deg; one that is missing is not homed), the last two set-points, and what was soaked
+    since, s: the first soak is taken to begin when the chamber sets off from the one to the other."""
 
     flap_open: bool = False
     camera_was_on: bool = False
     positions: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     from_degC: float = LABORATORY_degC
     to_degC: float = LABORATORY_degC
+    soaked_s: float = 0.0
 
     def after(self, step: Step) -> Situation:
         """What the step leaves behind."""
@@ -74,7 +78,9 @@ class Situation:
             case PowerCamera(on=True) | Capture():
                 return replace(self, camera_was_on=True)
             case StartChamber(chamber_degC) | SetTemperature(chamber_degC):
-                return replace(self, from_degC=self.to_degC, to_degC=chamber_degC)
+                return replace(self, from_degC=self.to_degC, to_degC=chamber_degC, soaked_s=0.0)
+            case Soak(duration_s):
+                return replace(self, soaked_s=self.soaked_s + duration_s)
             case MoveTo(axis, position):
                 return replace(self, positions=MappingProxyType({**self.positions, axis: position}))
             case _:
@@ -115,6 +121,16 @@ def axis_of(config: StandConfig, name: str) -> AxisSettings:
     return axis
 
 
+def soak_s(soak: Soak, found: Situation, chamber: ChamberModel) -> float:
+    """How long the soak is expected to take, s: until the chamber has been in its band for its last part, too, once
+    recorded runs have shown how fast it is."""
+    ramps = chamber.heating_ramps if found.to_degC > found.from_degC else chamber.cooling_ramps
+    if not soak.band_K or not ramps:
+        return soak.duration_s
+    arrives_s = chamber.arrival_s(found.from_degC, found.to_degC, soak.band_K) - found.soaked_s
+    return min(longest_s(soak), max(soak.duration_s, arrives_s + last_part_s(soak)))
+
+
 def settling_s(soak: SoakUntilSettled, found: Situation, chamber: ChamberModel) -> float:
     """How long the soak is expected to take, s: the chamber arrives, the camera follows with its time constant until it
     is slow enough, and then it has to stay so. How the image drifts is unknown until it was seen once."""
@@ -147,6 +163,8 @@ def _usual(step: Step, found: Situation, config: StandConfig, chamber: ChamberMo
         case CoolDown():
             work = kind_of(step) if found.camera_was_on else COOL_DOWN_AS_FOUND
             return Expectation(work, estimate_s(step, _boot_s(config)), 0.0)
+        case Soak():
+            return Expectation(kind_of(step), soak_s(step, found, chamber), 0.0)
         case SoakUntilSettled():
             return Expectation(kind_of(step), settling_s(step, found, chamber), 0.0)
         case _:

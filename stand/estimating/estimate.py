@@ -15,12 +15,14 @@ from experiments.steps import (
     PlannedStep,
     PowerCamera,
     SetTemperature,
+    Soak,
     SoakUntilSettled,
     StartChamber,
     Step,
     estimate_s,
     frames_of,
     kind_of,
+    last_part_s,
     longest_s,
     parameters_of,
 )
@@ -119,7 +121,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
                 expected.work,
                 expected.stated_s,
                 in_band_after_s,
-                _warning(step, approach, learned.chamber)
+                _warning(step, approach, learned.chamber, expected.stated_s)
                 or _in_the_dark(step, found)
                 or _unknown(expected.work, learned),
             )
@@ -169,13 +171,15 @@ def _in_the_dark(step: Step, found: Situation) -> str:
     return "the flap is closed, so these frames are dark; put open_flap before them, and close_flap after"
 
 
-def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:
+def _warning(step: Step, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
     """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then. Of a
     cool-down: that it is too short for a camera that was on."""
     if isinstance(step, CoolDown):
         needed_s = estimate_s(replace(step, max_s=math.inf), 0.0)
         too_short = f"ends after {_minutes(step.max_s)}; the camera needs {_minutes(needed_s)} to be within its band"
         return f"the cool-down {too_short}" if step.max_s < needed_s else ""
+    if isinstance(step, Soak):
+        return _longer(step, approach, chamber, expected_s)
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC)
     settled_s = chamber.settled_s(approach.from_degC, approach.to_degC)
     if not isinstance(step, Capture) or approach.captured or approach.age_s >= settled_s:
@@ -186,6 +190,18 @@ def _warning(step: Step, approach: _Approach, chamber: ChamberModel) -> str:
         f"{'before' if spare_s < 0.0 else 'after'} the chamber arrives; "
         f"the camera needs {_minutes(settled_s - arrives_s)} to follow"
     )
+
+
+def _longer(soak: Soak, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
+    """Of a soak that will not end in its time: until when it goes on, and that it ends without its band."""
+    if expected_s <= soak.duration_s:
+        return ""
+    arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC, soak.band_K) - approach.age_s
+    arrival = f"the chamber is within {soak.band_K:g} K of {approach.to_degC:g} degC after {_minutes(arrives_s)}"
+    if arrives_s + last_part_s(soak) <= longest_s(soak):
+        return f"{arrival}: the soak is expected to go on until {_minutes(expected_s)}"
+    end = "the run is held then" if soak.unsettled == "hold" else "the frames after it are marked as unsettled"
+    return f"{arrival}: too late for a soak of at most {_minutes(expected_s)}; {end}"
 
 
 def _unknown(work: str, learned: Learned) -> str:

@@ -16,6 +16,7 @@ from foundation.items import Event, StepMark, StepState
 from recording.reading.contents import PLAN_CHANGED
 from stand.estimating.estimate import PricedStep
 
+SOAK_LONGER = "soak_longer"  # the event that a soak goes on beyond its time, by_s more
 _REMEMBERED = 9  # the last measurements of a kind of work count
 _LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
 _LEAST_WITHIN_S = 60.0
@@ -116,7 +117,8 @@ class Eta:
 
     def event(self, event: Event) -> None:
         """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further.
-        `plan_changed`: an operator has changed what is still to be done. `to_ambient`, `at_ambient`, `not_at_ambient`:
+        `plan_changed`: an operator has changed what is still to be done. `soak_longer`: a soak goes on because the
+        chamber was not in its band. `to_ambient`, `at_ambient`, `not_at_ambient`:
         the way back begins or ends."""
         if event.kind == "held":
             self._held_since_ns = event.time_ns if self._held_since_ns is None else self._held_since_ns
@@ -126,7 +128,7 @@ class Eta:
             if self._held_since_ns is not None and not self._reasons:
                 self._held_ns += event.time_ns - self._held_since_ns
                 self._held_since_ns = None
-        elif event.kind == PLAN_CHANGED:
+        elif event.kind in (PLAN_CHANGED, SOAK_LONGER):
             self._change(event.data)
         elif event.kind == "to_ambient":
             self._after_since_ns = event.time_ns

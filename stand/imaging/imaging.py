@@ -66,12 +66,20 @@ class Imaging:
             with self._motions.under_way("flap", "closing"):
                 await self._flap.move_closed()
 
-    async def take_frame(self, exposure_s: float, step_id: str, due_ns: int = 0, cameras: Collection[str] = ()) -> bool:
-        """One frame of each camera, or of those named, for the step, published; the first exposed at `due_ns` when that
-        is still ahead. False when a camera was lost: see `_regain`; the flap may have been shut meanwhile."""
+    async def take_frame(
+        self,
+        exposure_s: float,
+        step_id: str,
+        due_ns: int = 0,
+        cameras: Collection[str] = (),
+        flags: tuple[str, ...] = (),
+    ) -> bool:
+        """One frame of each camera, or of those named, for the step, published with these flags; the first exposed at
+        `due_ns` when that is still ahead. False when a camera was lost: see `_regain`; the flap may have been shut
+        meanwhile."""
         self._interlock.check()
         try:
-            self._publish(await self._grab(exposure_s, due_ns, cameras), step_id)
+            self._publish(await self._grab(exposure_s, due_ns, cameras), step_id, flags)
         except Unreachable as error:
             await self._regain(error, exposure_s, cameras)
             return False
@@ -94,15 +102,15 @@ class Imaging:
         cameras = [camera for name, camera in self._cameras.items() if not names or name in names]
         return await grab_together(cameras, self._clock, exposure_s, due_ns)
 
-    def _publish(self, frames: Iterable[Frame], step_id: str) -> dict[str, Frame]:
+    def _publish(self, frames: Iterable[Frame], step_id: str, flags: tuple[str, ...] = ()) -> dict[str, Frame]:
         """By channel."""
         self._without_camera_ns = 0
         published: dict[str, Frame] = {}
         for frame in frames:
             name, _, _ = frame.channel.partition(".")
             is_doubted = self.doubt_of(f"{name}.temperature", frame.camera_degC, frame.time_ns)
-            flags = (*frame.flags, TEMPERATURE_IN_DOUBT) if is_doubted else frame.flags
-            published[frame.channel] = replace(frame, step_id=step_id, flags=flags)
+            of_it = (*flags, TEMPERATURE_IN_DOUBT) if is_doubted else flags
+            published[frame.channel] = replace(frame, step_id=step_id, flags=(*frame.flags, *of_it))
             self._hub.publish(published[frame.channel])
         return published
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from experiments.words import mark_in_words
+from experiments.words import doing_in_words, mark_in_words
 from foundation.clock import Clock, seconds_ns, utc_offset_ns
 from foundation.items import Batch, Event, Item, StepMark
 from foundation.readings import Quality
 from recording.writing.recorder import Recorder
-from stand.estimating.eta import Eta
+from stand.estimating.eta import SOAK_LONGER, Eta
 from stand.estimating.run_estimate import Night
 from stand.fault import Fault
 from stand.gate import Gate, Phase
@@ -57,7 +57,7 @@ class StatusBoard:
         self._recorder = recorder
         self._clock = clock
         self._step = 0
-        self._doing = ""
+        self._doing, self._goes_on = "", False
         self._state: State = STATES[stop.phase]
         self._since_ns = clock.now_ns()
         self._since_utc_offset_ns = self._warning_utc_offset_ns = utc_offset_ns(clock)
@@ -71,9 +71,10 @@ class StatusBoard:
             case StepMark():
                 self.eta.mark(item)
                 self._step = item.index + 1
-                self._doing = mark_in_words(item.kind, item.parameters)
+                self._doing, self._goes_on = mark_in_words(item.kind, item.parameters), False
             case Event():
                 self.eta.event(item)
+                self._goes_on |= item.kind == SOAK_LONGER
                 if item.level != "info":
                     self._warning, self._warning_utc_offset_ns = item, utc_offset_ns(self._clock)
             case Batch():
@@ -117,11 +118,7 @@ class StatusBoard:
 
     def _doing_now(self) -> str:
         """The step under way in words; before that a camera that was off comes to equilibrium."""
-        soaked_s = self._soaked_again_s()
-        if soaked_s is None:
-            return self._doing
-        soaking = f"the camera was or may have been off and soaks again, for {soaked_s / 60:.0f} min so far"
-        return f"{soaking}; then: {self._doing}" if self._doing else soaking
+        return doing_in_words(self._doing, self._soaked_again_s(), goes_on=self._goes_on)
 
     def left_s(self, now_ns: int) -> float:
         """How long the run still takes, from now on."""

@@ -83,6 +83,7 @@ _OF_KIND = {
     "not_at_ambient": "`stand status` shows when the air is as warm as the laboratory",
     "not_confirmed_safe": "switch the stand off by hand; `stand status` says when it is safe",
     "not_reported": "`stand session list` shows what the session lacks",
+    "soak_unsettled": "a fit leaves its frames out; give the recipe's soak more time, or see what keeps the chamber",
     "not_settled": "the plan goes on; `max_s` of the recipe's soak gives it longer",
     "not_resumed": "`stand clear`, then `stand resume`",
     "notify_failed": "`stand alert test` tries alerts",

@@ -94,8 +94,8 @@ steps:
     )
     once: list[Step] = []
     for degC, soak_s in ((22.0, 240.0), (24.0, 240.0), (25.0, 120.0)):
-        once += [SetTemperature(degC), Soak(soak_s), Capture(1, 0.5, 0.1, Role.OTHER, degC)]
-    once += [SetTemperature(20.0), Soak(60.0)]
+        once += [SetTemperature(degC), Soak(soak_s, band_K=0.0), Capture(1, 0.5, 0.1, Role.OTHER, degC)]
+    once += [SetTemperature(20.0), Soak(60.0, band_K=0.0)]
     assert steps == [StartChamber(20.0), *once, *once]
 
 
@@ -131,7 +131,7 @@ def test_a_capture_may_give_the_set_point_it_is_labelled_with():
         ("experiments: [{thermal_cicle: {}}]", "experiments.1: there is no experiment 'thermal_cicle'; did you mean"),
         ("steps: [opn_flap]", "steps.1: there is no step 'opn_flap'; did you mean open_flap? There are start_chamber,"),
         ("steps: [soak]", "steps.1: soak needs a value behind its colon"),
-        ("steps: [{soak: -1}]", "steps.1.soak: must be greater than or equal to 0 (got -1, line 2)"),
+        ("steps: [{soak: -1}]", "steps.1.soak.duration_s: must be greater than or equal to 0 (got -1, line 2)"),
         ("steps: [{soak: 1, open_flap: }]", "an entry is one step, this one has soak and open_flap; begin each with a"),
         ("steps: [{capture: {role: fitt}}]", "steps.1.capture.role: must be 'reference', 'fit', "),
         ("steps: [{capture: {role: settling}}]", "role settling is kept for the looks of soak_until_settled; give"),

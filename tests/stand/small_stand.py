@@ -105,7 +105,7 @@ class SmallStand:
     async def approach_again(self):
         self._check()
 
-    async def take_frame(self, exposure_s, step_id, due_ns, cameras):
+    async def take_frame(self, exposure_s, step_id, due_ns, cameras, flags):
         try:
             await self._act("take_frame")
             is_lost = self._clock.now_ns() < self.camera_back_ns or not self.supplied
@@ -168,9 +168,10 @@ class SmallStand:
 
 class Life:
     """One daemon, from its start to its death; what it leaves is in `folder`, and what it recorded in `disk`. decides:
-    the module of the process that makes the plan's decisions."""
+    the module of the process that makes the plan's decisions. follows: the chamber is always at its set-point, and says
+    so."""
 
-    def __init__(self, folder: Path, plan, start_ns, disk, chamber_degC, decides=""):
+    def __init__(self, folder: Path, plan, start_ns, disk, chamber_degC, decides="", *, follows=False):
         self.loop = asyncio.new_event_loop()
         self.wrong = []
         self.hub, self.clock = Hub(), VirtualClock(start_ns)
@@ -187,6 +188,7 @@ class Life:
         self._disk, self._unsaved = disk, []
         self._resumes = self._journal_path.exists()
         self._still = ExitStack()  # holds the clock
+        self._follows = follows
         self.publish_pv(chamber_degC)
         self.do(self._begin(folder))
 
@@ -216,6 +218,8 @@ class Life:
         self.executor = Executor(stand, self.hub, self.clock, self.log, self._flushed, *watches, decider=self._decider)
         self._flap = asyncio.create_task(keep_shut_in_holds(stand, self.hub, self.clock))
         self.run = asyncio.create_task(self._run(self.executor))
+        if self._follows:
+            self._chamber = asyncio.create_task(self._follow())
 
     async def _run(self, executor):
         """As a guarded run has it."""
@@ -267,6 +271,12 @@ class Life:
     def publish_pv(self, pv_degC):
         reading = Reading("regulator.pv", pv_degC, "degC", self.clock.now_ns())
         self.hub.publish(Batch("regulator", self.clock.now_ns(), (reading,)))
+
+    async def _follow(self):
+        while not self.run.done():
+            set_up = self.log.state.set_up
+            self.publish_pv(24.0 if set_up.chamber_degC is None else set_up.chamber_degC)
+            await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(0.5))
 
     def interlock(self, unconfirmed=False):
         """As the guard does: hold, then make safe; the run waits. The first try may not confirm."""

@@ -51,7 +51,7 @@ def life(tmp_path: Path):
     def begin(*answers: object, start_ns: int = START_NS) -> Life:
         if answers:
             (tmp_path / ANSWERS).write_text(json.dumps(answers))
-        begun = Life(tmp_path, PLAN, start_ns, disk, 24.0, "tests.stand.decisions_process")
+        begun = Life(tmp_path, PLAN, start_ns, disk, 24.0, "tests.stand.decisions_process", follows=True)
         begun.reported = []
         begun.hub.subscribe(begun.reported.append)
         lives.append(begun)

@@ -80,7 +80,7 @@ def test_no_set_point_changes_faster_than_a_camera_allows(tmp_path: Path):
     back = {"to_ambient": True}
     slow = load_config(stand(tmp_path, cameras=camera(ambient_K_per_min=0.5), ending=back))
     assert slow.set_point_K_per_min == 0.5
-    plan = list(number_steps([StartChamber(24.0), SetTemperature(34.0), Soak(60.0)]))
+    plan = list(number_steps([StartChamber(24.0), SetTemperature(34.0), Soak(60.0, band_K=0.0)]))
     assert [step.duration_s for step in price(plan, slow)] == pytest.approx([0.0, 10.0 / 0.5 * 60.0, 60.0])
     fast = load_config(stand(tmp_path, cameras=camera(), ending=back))
     assert way_back_s(plan, slow, Learned()) == pytest.approx(11.0 / 0.5 * 60.0)

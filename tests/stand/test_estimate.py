@@ -32,7 +32,9 @@ from stand.estimating.learned import Learned
 from tests.stand.priced_plans import BEGIN_NS, CAPTURE, marks, planned
 
 RESPONSE = Response(dead_s=0.0, rate_K_per_s=0.05, time_constant_s=100.0)
-CHAMBER = ChamberModel(heating=RESPONSE, cooling=RESPONSE, camera_time_constant_s=900.0)
+CHAMBER = ChamberModel(
+    heating=RESPONSE, cooling=RESPONSE, camera_time_constant_s=900.0, heating_ramps=1, cooling_ramps=1
+)
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +82,9 @@ def test_a_soak_says_when_the_chamber_arrives(config: StandConfig):
     plan = planned(StartChamber(24.0), Soak(600.0), SetTemperature(52.0), Soak(300.0), Soak(900.0), Soak(900.0))
     steps = price(plan, config, Learned(chamber=CHAMBER))
     arrives_s = CHAMBER.arrival_s(24.0, 52.0)
-    assert arrives_s > 300.0
-    wanted_s = [None, None, None, arrives_s, arrives_s - 300.0, None]
+    assert arrives_s > 600.0  # the first soak ends at its limit, twice its time
+    wanted_s = [None, None, None, arrives_s, arrives_s - 600.0, None]
+    assert [step.duration_s for step in steps[3:]] == [600.0, 900.0, 900.0]
     assert [step.in_band_after_s for step in steps] == [
         pytest.approx(wait_s) if wait_s else None for wait_s in wanted_s
     ]
@@ -91,8 +94,8 @@ def test_a_soak_says_when_the_chamber_arrives(config: StandConfig):
 @pytest.mark.parametrize(
     ("dwell_s", "warning"),
     [
-        (300.0, "the dwell at 52 degC ends 7 min before the chamber arrives; the camera needs 30 min to follow"),
-        (900.0, "the dwell at 52 degC ends 3 min after the chamber arrives; the camera needs 30 min to follow"),
+        (300.0, "the dwell at 52 degC ends 2 min before the chamber arrives; the camera needs 30 min to follow"),
+        (900.0, "the dwell at 52 degC ends 9 min after the chamber arrives; the camera needs 30 min to follow"),
         (2700.0, ""),
     ],
 )
@@ -100,7 +103,26 @@ def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: Sta
     soak = Soak(dwell_s / 2)
     plan = planned(OpenFlap(), StartChamber(24.0), SetTemperature(52.0), soak, soak, CAPTURE, CAPTURE)
     warnings = [step.warning for step in price(plan, config, Learned(chamber=CHAMBER))]
-    assert warnings == ["", "", "", "", "", warning, ""]
+    assert (*warnings[:3], *warnings[5:]) == ("", "", "", warning, "")
+
+
+@pytest.mark.parametrize(
+    ("soak", "expected_s", "warning"),
+    [
+        (Soak(1800.0), 1800.0, ""),
+        (Soak(60.0, band_K=0.0), 60.0, ""),
+        (Soak(600.0), 820.9, "the chamber is within 1 K of 52 degC after 10 min: the soak is expected to go on"),
+        (Soak(300.0), 600.0, "too late for a soak of at most 10 min; the frames after it are marked as unsettled"),
+        (Soak(300.0, unsettled="hold"), 600.0, "too late for a soak of at most 10 min; the run is held then"),
+    ],
+)
+def test_a_soak_that_will_not_end_in_its_time_is_expected_to_go_on_and_says_so(
+    config: StandConfig, soak: Soak, expected_s: float, warning: str
+):
+    *_, step = price(planned(StartChamber(24.0), SetTemperature(52.0), soak), config, Learned(chamber=CHAMBER))
+    assert step.duration_s == pytest.approx(expected_s, abs=1.0)
+    assert warning in step.warning
+    assert bool(warning) == bool(step.warning)
 
 
 def test_a_capture_through_a_closed_flap_warns(config: StandConfig):

@@ -231,11 +231,11 @@ async def test_steps_and_parts_within_parts_have_fields_of_their_own(night):
         await page.get_by_label("rate K per min").first.fill("0.7")
         await page.get_by_label("Kind of steps, one after another").select_option("soak")
         await page.get_by_role("button", name="Add to steps, one after another").click()
-        await page.get_by_label("soak", exact=True).last.fill("90")
+        await page.get_by_label("duration, s", exact=True).last.fill("90")
         await page.get_by_role("button", name="Add to the queue").click()
         await page.get_by_role("status").filter(has_text="is queued").wait_for()
         reported = json.loads(night.requests[night.queue[-1].key][0].recipe_text)
-        assert reported["steps"][-1] == {"soak": 90}
+        assert reported["steps"][-1]["soak"]["duration_s"] == 90
         repeat = next(step["repeat"] for step in reported["steps"] if "repeat" in step)
         assert repeat["steps"][0]["ramp"]["rate_K_per_min"] == 0.7
         before = len(list(parse_document(packaged("recipes", "ramps").read_text(), Recipe, "ramps").plan()))

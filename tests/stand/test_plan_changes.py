@@ -66,7 +66,7 @@ def life(tmp_path: Path):
     disk: list[object] = []
 
     def begin(start_ns: int = START_NS, plan=PLAN) -> Life:
-        begun = Life(tmp_path, plan, start_ns, disk, 24.0)
+        begun = Life(tmp_path, plan, start_ns, disk, 24.0, follows=True)
         begun.reported = []
         begun.hub.subscribe(begun.reported.append)
         lives.append(begun)
@@ -158,7 +158,7 @@ def test_a_soak_under_way_that_is_extended_takes_longer_by_that(life: Callable[.
     here.passes(150.0)
     assert soaked_s(here) == pytest.approx(145.0)
     done = next(m for m in here.reported if isinstance(m, StepMark) and m.kind == "Soak" and m.state is StepState.DONE)
-    assert done.parameters == {"duration_s": 145.0}
+    assert done.parameters["duration_s"] == 145.0
     assert done.step_id == ID[1]
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.live import Live
 
 from experiments.steps import Capture, Role, Soak, number_steps, parameters_of
+from experiments.words import doing_in_words
 from foundation.clock import NS_PER_S
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Reading, bad_reading
@@ -18,7 +19,9 @@ from recording.format.utc_offsets import UtcOffsets
 from stand.commands.control_cli import idle_lines
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price
+from stand.estimating.eta import SOAK_LONGER
 from stand.estimating.run_estimate import Night
+from stand.imaging.equilibrium import LOST, REACHED
 from stand.serving.desk import HeatByHand, ReadingState, StandState
 from stand.watching.follow import Follow
 from stand.watching.live import Foot, Lines
@@ -65,6 +68,9 @@ def follow() -> tuple[Follow, list[Moment], list[str]]:
     return Follow("a night", Night(price(plan, config)), moments.append, lines.append), moments, lines
 
 
+SOAK_ID = next(number_steps([Soak(600.0)])).step_id
+
+
 def mark(seconds: float, index: int, state: StepState) -> StepMark:
     step = (Soak(600.0), Capture(2, 1.0, 0.01, Role.FIT, 24.0))[index]
     return StepMark(
@@ -88,6 +94,22 @@ def test_a_run_is_followed_from_its_first_step_on(follow: tuple[Follow, list[Mom
     assert moments[-1].doing == "2 frames at 24 °C (fit)"
     assert moments[-1].share == pytest.approx(600 / 601, abs=0.01)
     assert moments[-1].end_ns == pytest.approx(BEGIN_NS + 601 * NS_PER_S, abs=5 * NS_PER_S)
+
+
+def test_what_a_step_waits_for_is_said_with_it(follow: tuple[Follow, list[Moment], list[str]]):
+    subscriber, moments, _ = follow
+    subscriber(mark(0, 0, StepState.STARTED))
+    subscriber(Event(BEGIN_NS, "warning", LOST, "it was off"))
+    subscriber(Batch("all", BEGIN_NS + 120 * NS_PER_S, ()))
+    again = doing_in_words("soak for 10 min", 120.0, goes_on=False)
+    assert moments[-1].doing == again != "soak for 10 min"
+    subscriber(Event(BEGIN_NS + 300 * NS_PER_S, "info", REACHED, "it is at rest"))
+    subscriber(Event(BEGIN_NS + 600 * NS_PER_S, "info", SOAK_LONGER, "", {"step_id": SOAK_ID, "by_s": 90.0}))
+    subscriber(Batch("all", BEGIN_NS + 601 * NS_PER_S, ()))
+    assert moments[-1].doing == doing_in_words("soak for 10 min", None, goes_on=True)
+    assert moments[-1].end_ns > BEGIN_NS + 690 * NS_PER_S
+    subscriber(mark(690, 1, StepState.STARTED))
+    assert moments[-1].doing == "2 frames at 24 °C (fit)"
 
 
 def test_each_warning_says_what_to_type(follow: tuple[Follow, list[Moment], list[str]]):

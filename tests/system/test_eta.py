@@ -73,7 +73,7 @@ def is_true(left: list[tuple[int, float]], session: Path, within_s: float) -> bo
 
 
 async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(SHORT_RECIPE.replace("dwell_s: 600", "dwell_s: 1500"))  # the first cooling takes more than 600 s
+    ordered = order(SHORT_RECIPE.replace("dwell_s: 600", "dwell_s: 2700"))  # the first cooling takes more than 600 s
     session, left = await followed(ordered, tmp_path)
     assert len(left) > 100
     assert worst_share(left, session) < 0.05
@@ -85,7 +85,7 @@ async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path,
     assert sum(step.duration_s for step in plan) == pytest.approx(truth_s, abs=0.5)
     assert (learned.chamber.heating_ramps, learned.chamber.cooling_ramps) == (2, 1)
     arrivals_s = [step.in_band_after_s for step in plan if step.planned.index > 6 and step.in_band_after_s is not None]
-    assert all(100 < arrival_s < 1500 for arrival_s in arrivals_s)
+    assert all(100 < arrival_s < 2700 for arrival_s in arrivals_s)
     assert len(arrivals_s) == 3
 
 

@@ -32,6 +32,7 @@ experiments:
       set_points_degC: [30, 20, 26, 22]
       held_out_degC: [22]
       dwell_s: 120
+      band_K: 0
       reference_frames: 2
 """
 EVERY_SEQUENCE = (
@@ -47,6 +48,7 @@ EVERY_SEQUENCE = (
       positions: [{linear_mm: 20, rotary_deg: 0}, {linear_mm: 25, rotary_deg: 4}]
       equilibrium_s: 120
       dwell_s: 120
+      band_K: 0
       reference_frames: 1
       frames_per_position: 1
 """
@@ -59,6 +61,7 @@ experiments:
       equilibrium_s: 60
       set_points_degC: [25]
       dwell_s: 60
+      band_K: 0
       reference_frames: 1
 """
 WARM_UP_ALONE = """

@@ -32,7 +32,7 @@ from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_run import at_step, fault
 
-NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
+NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")
 ITEMS_PER_LIFE = 400  # about a set-point's worth: with fewer the night would hardly get on
 
 

@@ -38,6 +38,7 @@ from foundation.clock import NS_PER_S, Clock
 from foundation.errors import ConfigError, DeviceError, Superseded
 from foundation.hub import Hub
 from foundation.items import StepMark, StepState
+from foundation.readings import UNSETTLED
 from foundation.tasks import cancelled, first_of
 from recording.format.restarts import restarted
 from recording.reading.contents import PLAN_CHANGED
@@ -68,12 +69,12 @@ from stand.running.executing.camera_gap import OffsetWatch
 from stand.running.executing.deciding import Decided, change_of_plan, fixed_plan
 from stand.running.executing.restoring import restore
 from stand.running.executing.settling_watch import SettlingWatch
+from stand.running.executing.soaking import Soaking
 from stand.running.memory.entries import (
     Again,
     Change,
     Cooled,
     Due,
-    Dwell,
     Edited,
     Extended,
     Readying,
@@ -85,16 +86,13 @@ from stand.running.memory.entries import (
 )
 from stand.running.memory.fold import after, change_text, refusal
 from stand.running.memory.journal import Logbook
-from stand.running.memory.state import Plan, RunState, duration_of
+from stand.running.memory.state import Plan, RunState
 from stand.stand import Stand
 
 
 def unguarded(error: DeviceError) -> None:
     """Where no guard holds a run, a device error ends it."""
     raise error
-
-
-_JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
 
 
 class Executor:
@@ -125,7 +123,7 @@ class Executor:
         self._clock = clock
         self._log = log
         self._flushed = flushed
-        self._settling = settling
+        self._soaking = Soaking(stand.gate, clock, log, settling)
         self._offsets = offsets
         self._allowed = allowed
         self._lost = lost
@@ -174,6 +172,10 @@ class Executor:
         self._changed.set()
         self._changed = asyncio.Event()
         await self._log.write(change)
+
+    def _changes(self) -> asyncio.Event:
+        """Set when the plan is changed the next time."""
+        return self._changed
 
     @property
     def _state(self) -> RunState:
@@ -236,7 +238,7 @@ class Executor:
             case Restore(set_up):
                 await restore(stand, self._log, self._clock, set_up, self._surroundings)
             case Earn(soak):
-                await self._earn(soak.step_id)
+                await self._soaking.earn(soak.step_id, self._changes)
             case Equilibrate():
                 changes = self._state.changes
                 await stand.imaging.supply.equilibrium.regained(
@@ -346,34 +348,13 @@ class Executor:
             missing_s = (self._clock.now_ns() - self._state.seen_ns) / NS_PER_S
             text = f"the run was held: the camera has warmed up for {missing_s:.1f} s without a frame"
             self._log.tell("warning", "warm_up_gap", text)
-        is_taken = await self._stand.imaging.take_frame(capture.exposure_s, step_id, frame.due_ns, capture.cameras)
+        flags = (UNSETTLED,) if self._state.is_unsettled and capture.role is not Role.WARM_UP else ()
+        imaging = self._stand.imaging
+        is_taken = await imaging.take_frame(capture.exposure_s, step_id, frame.due_ns, capture.cameras, flags)
         now_ns = self._clock.now_ns()
         if is_taken:
             self._log.enter(Taken(now_ns, step_id))
         self._log.enter(Due(now_ns, due_after_ns(frame.due_ns, capture, now_ns), lost=not is_taken))
-
-    async def _earn(self, step_id: str) -> None:
-        """Earn what a soak still owes while nothing holds the run; returns early when the set-up was disturbed."""
-        self._settling.restart()
-        while (soak := self._state.step(step_id)) and (owed_ns := self._state.owed_ns(soak)):
-            if self._is_kept():
-                return
-            begin_ns, earned_ns = self._clock.now_ns(), duration_of(soak) - owed_ns
-            slept = self._clock.sleep_until(begin_ns + min(owed_ns, _JOURNAL_NS))
-            await first_of(slept, self._stand.gate.closed(), self._changed.wait())
-            soak = self._state.step(step_id) or soak  # it may be longer now
-            is_settled = False
-            if isinstance(soak.step, SoakUntilSettled) and not self._is_kept() and self._state.owed_ns(soak):
-                soaked_s = (earned_ns + self._clock.now_ns() - begin_ns) / NS_PER_S
-                is_settled = await self._settling.is_settled(soak.step, step_id, soaked_s)
-            now_ns, whole_ns = self._clock.now_ns(), duration_of(self._state.step(step_id) or soak)
-            earned_ns = whole_ns if is_settled else min(earned_ns + now_ns - begin_ns, whole_ns)
-            if step_id not in self._state.skipped:
-                await self._log.write(Dwell(now_ns, step_id, earned_ns / NS_PER_S))
-
-    def _is_kept(self) -> bool:
-        """From earning anything."""
-        return bool(self._stand.gate.reasons) or self._state.is_disturbed
 
     async def _unless_skipped(self, step_id: str, work: Coroutine[None, None, None]) -> None:
         """The work of a step, broken off when that is left out."""

@@ -1,8 +1,9 @@
-"""Watches a soaking camera: keeps what the chamber and the camera's thermometer say, and looks at the target."""
+"""Watches a soak: keeps what the chamber's and the camera's thermometers say, and looks at the target."""
 
 from __future__ import annotations
 
 import importlib
+import math
 from array import array
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -58,11 +59,23 @@ class SettlingWatch:
         self._lane.close()
 
     def restart(self) -> None:
-        """A new window: what was seen before a soak, a pause or a disturbance proves nothing about the time after."""
-        for readings in self._readings.values():
-            del readings[:]
+        """A new window: what was seen of the camera before a soak, a pause or a disturbance proves nothing about the
+        time after."""
+        del self._readings[CAMERA][:]
         self._forget_looks("")
         self._due_ns = None
+
+    def in_band_s(self, chamber_degC: float, band_K: float) -> float:
+        """For how long the chamber has been within `band_K` of its set-point, as far as it is known without a gap, s;
+        0 when it is not, or is not known now."""
+        now_s, (time_s, pv_degC) = seconds(self._clock.now_ns()), np.array(self._readings[CHAMBER]).reshape(-1, 2).T
+        if not time_s.size or now_s - time_s[-1] > _UNKNOWN_S:
+            return 0.0
+        is_out = ~(np.abs(pv_degC - chamber_degC) <= band_K)  # NaN is out
+        is_out[1:] |= np.diff(time_s) > _UNKNOWN_S
+        ends = np.flatnonzero(is_out)
+        since = 0 if not ends.size else int(ends[-1]) + 1
+        return 0.0 if since == time_s.size else now_s - float(time_s[since])
 
     async def is_settled(self, soak: SoakUntilSettled, step_id: str, soaked_s: float) -> bool:
         """Whether the soak, `soaked_s` old, may end now; says so, and also when it has to end without.
@@ -124,7 +137,8 @@ class SettlingWatch:
             for reading in item.readings:
                 kept = self._readings.get(reading.channel)
                 if kept is not None and not _is_passing(reading, kept):
-                    kept.extend((seconds(reading.time_ns), reading.value))
+                    is_doubted = reading.cause == "doubt"
+                    kept.extend((seconds(reading.time_ns), math.nan if is_doubted else reading.value))
                     if len(kept) > 4 * _KEPT:
                         del kept[: 2 * _KEPT]
 

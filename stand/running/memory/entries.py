@@ -65,11 +65,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Dwell:
-    """A soak has earned `earned_s` of its duration; also after its end, when it has to be earned again."""
+    """A soak has earned `earned_s`; also after its end, when it has to be earned again. ended: once it has, with the
+    chamber in its band or without ("" in journals from before 2026-11-27)."""
 
     time_ns: int
     step_id: str
     earned_s: float
+    ended: Literal["", "settled", "unsettled"] = ""
 
 
 @dataclass(frozen=True, slots=True)

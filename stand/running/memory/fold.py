@@ -8,7 +8,7 @@ Pure: no clock, no disk, no device.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import reduce
 from types import MappingProxyType
@@ -61,10 +61,12 @@ def after(state: RunState, entry: Entry) -> RunState:
     match entry:
         case Step():
             return _begun(state, entry) if entry.state == "started" else _done(state, entry)
-        case Dwell(_, step_id, earned_s):
+        case Dwell(_, step_id, earned_s, ended):
             if step_id in state.skipped:
                 return state
-            return replace(state, earned_ns=_with(state.earned_ns, step_id, seconds_ns(earned_s)))
+            soaked = {**_begun_anew(state, {step_id}), **({step_id: ended} if ended else {})}
+            earned_ns = _with(state.earned_ns, step_id, seconds_ns(earned_s))
+            return replace(state, earned_ns=earned_ns, soaked=MappingProxyType(soaked))
         case Taken():
             return _taken(state, entry)
         case Due(_, due_ns, lost):
@@ -151,7 +153,8 @@ def _changed(state: RunState, change: Change) -> RunState:
                 state = replace(state, under_way="", due_ns=None, is_lost=False)
             return _placed(state)
         case Extended(_, step_id, by_s):
-            return replace(state, plan=tuple(_longer(each, step_id, by_s) for each in state.plan))
+            plan = tuple(_longer(each, step_id, by_s) for each in state.plan)
+            return replace(state, plan=plan, soaked=_begun_anew(state, {step_id}))
         case Edited(_, first, by):
             made = (step_of(str(each.get("kind")), _mapping(each.get("parameters"))) for each in by)
             return _placed(replace(state, plan=(*state.plan[:first], *number_steps(made, first))))
@@ -167,7 +170,8 @@ def _longer(planned: PlannedStep, step_id: str, by_s: float) -> PlannedStep:
     if planned.step_id != step_id or not isinstance(step, AnySoak):
         return planned
     if isinstance(step, Soak):
-        return replace(planned, step=replace(step, duration_s=step.duration_s + by_s))
+        max_s = None if step.max_s is None else step.max_s + by_s
+        return replace(planned, step=replace(step, duration_s=step.duration_s + by_s, max_s=max_s))
     return replace(planned, step=replace(step, min_s=step.min_s + by_s, max_s=step.max_s + by_s))
 
 
@@ -270,11 +274,17 @@ def _again(state: RunState, entry: Again) -> RunState:
         begun=state.begun.minus(ids),
         skipped=state.skipped.minus(ids),
         frames=frames,
+        soaked=_begun_anew(state, ids),
         taken_again=MappingProxyType({**counts, **lossy}) if lossy else counts,
     )
     if ids != frozenset((state.under_way,)):
         kept = replace(kept, under_way="", due_ns=None, is_lost=False, disturbances=state.disturbances + 1)
     return _placed(kept)
+
+
+def _begun_anew(state: RunState, step_ids: Collection[str]) -> Mapping[str, str]:
+    """How soaks have ended, without these, which have not."""
+    return MappingProxyType({each: ended for each, ended in state.soaked.items() if each not in step_ids})
 
 
 def _with(values: Mapping[str, int], name: str, value: int) -> Mapping[str, int]:

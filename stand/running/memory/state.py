@@ -23,6 +23,7 @@ from experiments.steps import (
     SoakUntilSettled,
     StartChamber,
     StopChamber,
+    band_K_of,
     longest_s,
 )
 from foundation.clock import NS_PER_S, seconds_ns
@@ -86,8 +87,9 @@ class RunState:
 
     done, begun, skipped: ids of steps; what is skipped counts as done. under_way: the id of the step that was begun by
     this daemon and is not done, "" when there is none. earned_ns: of soaks, by id; one that is done and not listed has
-    earned all of it. frames: by the id of a capture that is not done. taken_again: by the same, how often because the
-    disk had lost some of them. changes: of the plan, as they came.
+    earned all of it. soaked: by the same, how they ended, where that is said. frames: by the id of a capture that is
+    not done. taken_again: by the same, how often because the disk had lost some of them. changes: of the plan, as they
+    came.
 
     disturbances: how often something may have undone the set-up (an interlock, a camera that was off, a daemon's death,
     a warm-up that is restarted), of which so many are `restored`. is_cold: the camera was or may have been off, and the
@@ -109,6 +111,7 @@ class RunState:
     skipped: Ids = field(default_factory=Ids)
     under_way: str = ""
     earned_ns: Mapping[str, int] = field(default_factory=_nothing)
+    soaked: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     frames: Mapping[str, int] = field(default_factory=_nothing)
     taken_again: Mapping[str, int] = field(default_factory=_nothing)
     changes: tuple[Change, ...] = ()
@@ -153,6 +156,12 @@ class RunState:
         """Whether a capture of the plan is not done."""
         return any(isinstance(each.step, Capture) and each.step_id not in self.done for each in self.plan[self.index :])
 
+    @property
+    def is_unsettled(self) -> bool:
+        """Whether the last guaranteed soak at the present set-point ended without the chamber in its band."""
+        soaks = (soak.step_id for soak in reversed(self.set_up.soaks) if _is_guaranteed(soak))
+        return self.soaked.get(next(soaks, "")) == "unsettled"
+
     def step(self, step_id: str) -> PlannedStep | None:
         """The step of that id in the plan in force."""
         if self.index < len(self.plan) and self.plan[self.index].step_id == step_id:
@@ -160,7 +169,9 @@ class RunState:
         return next((planned for planned in self.plan if planned.step_id == step_id), None)
 
     def owed_ns(self, soak: PlannedStep) -> int:
-        """What the soak has not earned yet."""
+        """What the soak has not earned yet of its longest time; nothing when it has ended."""
+        if soak.step_id in self.soaked:
+            return 0
         duration_ns = duration_of(soak)
         earned_ns = self.earned_ns.get(soak.step_id, duration_ns if soak.step_id in self.done else 0)
         return max(0, duration_ns - earned_ns)
@@ -171,5 +182,9 @@ class RunState:
 
 
 def duration_of(soak: PlannedStep) -> int:
-    """What the soak takes when it is not cut short, ns; 0 when it is no soak."""
+    """What the soak takes at the most, ns; 0 when it is no soak."""
     return seconds_ns(longest_s(soak.step)) if isinstance(soak.step, AnySoak) else 0
+
+
+def _is_guaranteed(soak: PlannedStep) -> bool:
+    return isinstance(soak.step, AnySoak) and band_K_of(soak.step) > 0.0

@@ -77,7 +77,7 @@ export class RecipeForm {
 
   // An object within another: its fields are there when it is asked for.
   object_field(name, schema, value, required) {
-    const given = long(value), inner = this.fields(schema, given ?? {});
+    const given = whole(schema, long(value)), inner = this.fields(schema, given ?? {});
     const is_asked = h("input", { type: "checkbox", "aria-label": words(name) });
     is_asked.checked = required || Boolean(given);
     const box = h("fieldset", { hidden: !is_asked.checked }, h("legend", {}, words(name)), inner.map((each) => each.row));
@@ -95,7 +95,7 @@ export class RecipeForm {
     const add = (value) => {
       const kind = is_choice ? Object.keys(value)[0] : null;
       const chosen = is_choice ? this.resolve(items.properties[kind]) : items;
-      const inner = chosen.properties ? this.fields(chosen, (is_choice ? value[kind] : value) ?? {}) : [this.field(kind, chosen, value[kind], true)];
+      const inner = chosen.properties ? this.fields(chosen, whole(chosen, is_choice ? value[kind] : value) ?? {}) : [this.field(kind, chosen, value[kind], true)];
       const found = () => (chosen.properties ? collect(inner) : inner[0].value() ?? value[kind] ?? {});
       const row = { value: () => (is_choice ? { [kind]: found() } : found()) };
       const box = h("fieldset", {}, h("legend", {}, words(kind ?? name)), inner.map((each) => each.row),
@@ -136,6 +136,9 @@ function nested(made) {
 
 // What may be written as a word is an object with that key: `open_flap`, `settled`.
 const long = (value) => (typeof value === "string" ? { [value]: {} } : value);
+
+// What may be written as a number is an object with its first required key: `soak: 2700`.
+const whole = (schema, value) => (typeof value === "number" ? { [schema.required[0]]: value } : value);
 
 const is_texts = (schema) => schema.anyOf?.some((each) => each.type === "array" && each.items?.type === "string");
 
