@@ -21,6 +21,7 @@ from foundation.output import Output, json_line, output, say
 from foundation.usage import one_line
 from stand.commands.checked_cli import warn_unchecked
 from stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
+from stand.commands.reloading import Reloading
 from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.interface_section import load_tokens
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -31,6 +32,7 @@ from stand.serving.api.bridge import Bridge
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import serve as serve_clients
 from stand.serving.api.server import try_doors
+from stand.serving.api.token_book import TokenBook
 from stand.serving.secop.door import door_at
 from stand.serving.viewing import Viewing
 from stand.watching.aside import aside
@@ -56,8 +58,8 @@ def serve(
 ) -> None:
     """Own the stand until it is stopped: status, devices by hand, and a queue whose runs are its guests.
 
-    SIGTERM or Ctrl-C makes the stand safe and ends it; the run under way may be resumed. With --json what happens as
-    events, one a line.
+    SIGTERM or Ctrl-C makes the stand safe and ends it; the run under way may be resumed. SIGHUP reads the tokens again,
+    unless the terminal is closed: then it is an end, too. With --json what happens as events, one a line.
 
     Example: stand serve laboratory.yaml --out /data/sessions
     """
@@ -68,11 +70,11 @@ def serve(
     stand = load_config(path)
     texts = _attachments(path, stand)
     directory = (out or stand.recording.directory).absolute()
-    tokens, hosts = load_tokens(stand.interface.secrets), stand.interface.hosts
+    secrets, trusts = stand.interface.secrets, stand.interface.trust_loopback
+    book = TokenBook(None if secrets is None else load_tokens(secrets))
     secop_port = stand.interface.secop_port if secop is None else secop
-    others = () if secop_port is None else (door_at(secop_port),)
-    trusts = stand.interface.trust_loopback
-    interface = Interface(directory, host, port, tokens, hosts, trusts_loopback=trusts, doors=others)
+    others = () if secop_port is None else (door_at(secop_port, read_only=trusts == "read-only"),)
+    interface = Interface(directory, host, port, book, stand.interface.hosts, trusts_loopback=trusts, doors=others)
     interface.check()
     try_doors(interface)
 
@@ -87,9 +89,11 @@ def serve(
             event = Event(clock.now_ns(), "info", "open", opened, {"sessions": str(directory), "port": port})
             _tell_json(event) if output().as_json else say(opened)
             with _events_shown(hub):
-                if tokens and trusts and (port is not None or others):
-                    text = "every program of this machine operates this stand without a token (trust_loopback)"
+                if secrets is not None and trusts and (port is not None or others):
+                    may = "may look at this stand and stop it" if trusts == "read-only" else "operates this stand"
+                    text = f"every program of this machine {may} without a token (trust_loopback)"
                     hub.publish(Event(clock.now_ns(), "warning", "loopback_trusted", text))
+                Reloading(secrets, book, clock.now_ns, hub.publish).begin()
                 yield
 
     asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))
@@ -144,4 +148,4 @@ def _tell_json(event: Event) -> None:
 def _is_shown(event: Event, wanted: Output) -> bool:
     if wanted.quiet:
         return event.level == "error"
-    return wanted.verbose or event.level != "info" or event.kind in ("queue", "command")
+    return wanted.verbose or event.level != "info" or event.kind in ("queue", "command", "tokens_read")

@@ -98,6 +98,8 @@ NotifyAccess=main
 User={user}
 WorkingDirectory={_of_unit(str(config.parent))}
 ExecStart={" ".join(map(_quoted, arguments))}
+# The tokens of the network are read again.
+ExecReload=/bin/kill -HUP $MAINPID
 Restart=on-failure
 RestartSec=10
 WatchdogSec={_WATCHDOG_S}

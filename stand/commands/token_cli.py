@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from foundation.command_app import App
 from foundation.errors import ConfigError
-from foundation.output import output, show
+from foundation.output import output, say, show
 from stand.commands.reached import ConfigOption, DirectoryArgument, reached
 from stand.serving.client import API, Answer
+
+if TYPE_CHECKING:
+    pass
 
 app = App(
     no_args_is_help=True,
@@ -24,65 +27,82 @@ _BYTES = 32
 
 
 @app.command()
-def add(name: NameArgument, config: ConfigOption = "simulated") -> None:
-    """Make a token and print it, once. A daemon that is already running knows it after its next start.
+def add(
+    name: NameArgument,
+    config: ConfigOption = "simulated",
+    read_only: Annotated[bool, typer.Option("--read-only", help="May look and press STOP, but order nothing.")] = False,
+) -> None:
+    """Make a token and print it, once. A daemon that is already running knows it after SIGHUP, or its next start.
 
     Example: stand token add rose --config my-stand.yaml
     """
     from stand.config.interface_section import TokenFile, load_tokens, write_tokens
 
     path = _file(config)
-    tokens = load_tokens(path) if path.expanduser().exists() else {}
-    if name in tokens:
+    known = load_tokens(path) if path.expanduser().exists() else TokenFile()
+    if name in known.by_name():
         raise ConfigError(f"{path}: {name} has a token already; `stand token remove {name}` first")
     token = secrets.token_urlsafe(_BYTES)
+    kind = "read_only" if read_only else "tokens"
     try:
-        TokenFile(tokens={name: token})
+        added = TokenFile.model_validate({**known.model_dump(), kind: {**getattr(known, kind), name: token}})
     except ValueError:
         raise ConfigError(f"{name!r}: a name has up to 64 letters, digits and . _ @ -") from None
-    write_tokens(path, {**tokens, name: token})
-    show({"name": name, "token": token}, [token])
+    write_tokens(path, added)
+    show({"name": name, "token": token, "read_only": read_only}, [token])
+    _say_when("knows it")
 
 
 @app.command("list")
 def list_names(config: ConfigOption = "simulated") -> None:
-    """Who has a token.
+    """Who has a token, and who may only look.
 
     Example: stand token list --config my-stand.yaml
     """
     from stand.config.interface_section import load_tokens
 
-    names = sorted(load_tokens(_file(config)))
-    show(names, names)
+    found = [(name, read_only) for name, (_, read_only) in sorted(load_tokens(_file(config)).by_name().items())]
+    lines = [f"{name}  read-only" if read_only else name for name, read_only in found]
+    show([{"name": name, "read_only": read_only} for name, read_only in found], lines)
 
 
 @app.command()
 def remove(name: NameArgument, config: ConfigOption = "simulated") -> None:
-    """Take a token back; a daemon that runs already knows it until it is started again.
+    """Take a token back. A daemon that is already running forgets it at SIGHUP, with all that it has open.
 
     Example: stand token remove rose --config my-stand.yaml
     """
     from stand.config.interface_section import load_tokens, write_tokens
 
     path = _file(config)
-    tokens = load_tokens(path)
-    if name not in tokens:
+    known = load_tokens(path)
+    if name not in known.by_name():
         raise ConfigError(f"{path}: {name} has no token; `stand token list` shows who has")
-    write_tokens(path, {other: token for other, token in tokens.items() if other != name})
+    write_tokens(path, known.without(name))
     show({"removed": name}, ())
+    _say_when("forgets it, and disconnects who has it")
 
 
 @app.command()
-def login(directory: DirectoryArgument = None, config: ConfigOption = "simulated") -> None:
+def login(
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    read_only: Annotated[bool, typer.Option("--read-only", help="For who may look and press STOP only.")] = False,
+) -> None:
     """An address that opens the page in a browser elsewhere, once, within ten minutes. Asked of the running daemon.
 
     Example: stand token login
     """
     server = reached(directory, config, anywhere=True)
-    answer = cast("Answer", server.request("POST", f"{API}/login"))
+    answer = cast("Answer", server.request("POST", f"{API}/login", {"read_only": read_only}))
     if not answer["url"] and not output().as_json:
         raise ConfigError(f"{server.name}: its daemon does not listen to the network; start it with --port")
     show(answer, [str(answer["url"])])
+
+
+def _say_when(what: str) -> None:
+    """How a daemon learns of it. No signal is sent from here: to `stand run`, which has no tokens, it is an end."""
+    say(f"a running `stand serve` {what} at SIGHUP (`systemctl reload` of its unit, or kill -HUP), or its next start")
 
 
 def _file(config: str) -> Path:

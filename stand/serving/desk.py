@@ -37,9 +37,9 @@ Verb = Literal[
     "note",
     "fault",
 ]
-# socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. secop: SECoP on this
-# machine. terminal: a signal or key.
-How = Literal["socket", "loopback", "token", "secop", "terminal", "queue"]
+# socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. network: TCP without one,
+# which STOP needs not. secop: SECoP on this machine. terminal: a signal or key.
+How = Literal["socket", "loopback", "token", "network", "secop", "terminal", "queue"]
 When = Literal["now", "step"]
 StepStanding = Literal["waiting", "under_way", "done", "skipped"]
 
@@ -59,10 +59,12 @@ class Value(BaseModel):
 
 
 class Who(Value):
-    """Who asks. name: the user of the socket, else the name of the token; "" when it is not known."""
+    """Who asks. name: the user of the socket, else the name of the token; "" when it is not known. read_only: may look
+    and press STOP, but order nothing."""
 
     name: str
     how: How
+    read_only: bool = False
 
 
 class RunStatus(Value):

@@ -71,6 +71,7 @@ _OF_KIND = {
     "journal_damaged": "`stand status --plan` shows what counts as done",
     "journal_not_saved": _DISK,
     "left_on": _SWITCHED,
+    "tokens_not_read": "mend the file, and send SIGHUP again; `stand token list` reads it, too",
     "daemon_file_damaged": "read the counters in the damaged file, if they matter",
     "latch_not_cleared": "`stand clear` again, when the disk answers",
     "latch_not_kept": "see that the folder of the stand's state is there and has room",

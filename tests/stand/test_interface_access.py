@@ -12,13 +12,25 @@ import pytest
 from websockets.asyncio.client import connect
 
 from foundation.errors import ConfigError
+from stand.config.interface_section import TokenFile
 from stand.serving.api import access
-from stand.serving.api.access import BODY_LIMIT_BYTES, COOKIE, CSP, STOP_PATH, Access, is_open
+from stand.serving.api.access import (
+    BODY_LIMIT_BYTES,
+    CHECK_PATH,
+    COOKIE,
+    CSP,
+    INVITE_PATH,
+    STOP_PATH,
+    Access,
+    is_open,
+)
 from stand.serving.api.doors import Interface, OtherDoor
+from stand.serving.api.token_book import TokenBook
 from stand.serving.client import server_at
 from tests.stand.a_desk import ADesk, served
 
-TOKEN = "correct-horse-battery-staple"
+TOKEN, LOOKS = "correct-horse-battery-staple", "only-looks-and-stops-for-wall"
+CHANGES_NOTHING = (STOP_PATH, CHECK_PATH, INVITE_PATH)
 EVIL = "http://evil.example"
 # What a proxy adds: such a request is from elsewhere, and needs a token.
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
@@ -45,6 +57,11 @@ HOSTILE = (
 BARE_PROXY = "anybody behind a proxy on this machine that adds no header"
 
 
+def book(**read_only: str) -> TokenBook:
+    """With rose's token, and these."""
+    return TokenBook(TokenFile(tokens={"rose": TOKEN}, read_only=read_only))
+
+
 def free_port() -> int:
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
@@ -54,8 +71,8 @@ def free_port() -> int:
 @asynccontextmanager
 async def open_stand(folder: Path, *, trusts_loopback: bool = True) -> AsyncIterator[tuple[ADesk, int]]:
     port = free_port()
-    tokens, hosts = {"rose": TOKEN}, ("stand.example",)
-    interface = Interface(folder, port=port, tokens=tokens, hosts=hosts, trusts_loopback=trusts_loopback)
+    hosts = ("stand.example",)
+    interface = Interface(folder, port=port, tokens=book(wall=LOOKS), hosts=hosts, trusts_loopback=trusts_loopback)
     async with served(ADesk(), folder / "night", interface) as desk:
         yield desk, port
 
@@ -100,19 +117,23 @@ def routes(port: int) -> list[tuple[str, str]]:
         ("a wrong token", {**PROXIED, "Authorization": "Bearer wrong"}, 401),
         ("a wrong token here", {"Authorization": f"Basic {TOKEN}"}, 401),
         ("a name of this stand without a token", {"Host": "stand.example"}, 401),
+        ("two tokens", {"Authorization": f"Bearer {TOKEN}", "authorization": "Bearer x"}, 401),
         ("a wrong cookie", {**PROXIED, "Cookie": f"{COOKIE}=x"}, 401),
+        ("a token that may only look", {**PROXIED, "Authorization": f"Bearer {LOOKS}"}, 403),
         (BARE_PROXY, {}, 401),
         (BARE_PROXY, {"Host": "127.0.0.1"}, 401),
     ],
 )
 async def test_every_route_refuses(tmp_path: Path, attack: str, headers: dict[str, str], status: int):
-    of_host = "Host" in headers and status == 403
+    of_host, looks = "Host" in headers and status == 403, attack == "a token that may only look"
     async with open_stand(tmp_path, trusts_loopback=attack != BARE_PROXY) as (desk, port):
         found, wrong = await asyncio.to_thread(routes, port), []
         assert len(found) > 25
         for method, path in found:
             got, answered, body = await asyncio.to_thread(ask, port, method, path, headers)
             refused = of_host or (method != "GET" if status == 403 else not is_open(path))
+            if looks:
+                refused = method != "GET" and path not in CHANGES_NOTHING
             if status == 401 and "Authorization" in headers:
                 refused = True  # who shows a token shows a right one, wherever
             if refused and (got != status or not json.loads(body)["error"]):
@@ -127,9 +148,10 @@ async def test_every_route_refuses(tmp_path: Path, attack: str, headers: dict[st
                 wrong.append((method, path, got))
         viewer = await asyncio.to_thread(ask, port, "GET", "/api/v1/stream", {**UPGRADE, **headers})
     assert wrong == []
-    assert (viewer[0], bool(json.loads(viewer[2])["error"])) == (status, True)
+    assert looks or (viewer[0], bool(json.loads(viewer[2])["error"])) == (status, True)
+    assert not looks or viewer[0] == 101
     stops = [verb for _, verb, _ in desk.orders if verb == "stop"]
-    needs_no_token = status == 401 and "Authorization" not in headers
+    needs_no_token = looks or (status == 401 and "Authorization" not in headers)
     assert (len(stops), len(desk.orders)) == ((1, 1) if needs_no_token else (0, 0))
 
 
@@ -164,7 +186,7 @@ async def test_with_a_token_a_cookie_or_from_here_it_is_served(tmp_path: Path):
 
 
 async def test_an_address_of_this_machine_is_a_name_of_the_stand_and_any_other_is_not(tmp_path: Path):
-    known = Access({}, ())
+    known = Access()
     scope = {"type": "http", "method": "GET", "server": ("192.0.2.5", 80), "client": ("192.0.2.9", 1)}
 
     def is_let_in(host: str) -> bool:
@@ -251,15 +273,15 @@ def test_a_wide_bind_without_a_token_is_refused(tmp_path: Path):
     for host in ("0.0.0.0", "::", "192.0.2.1", "stand.example"):
         with pytest.raises(ConfigError, match="others on the network could operate this stand"):
             Interface(tmp_path, host=host, port=1).check()
-        Interface(tmp_path, host=host, port=1, tokens={"rose": TOKEN}).check()
+        Interface(tmp_path, host=host, port=1, tokens=book()).check()
     for host in ("127.0.0.1", "::1", "localhost", "127.1.2.3"):
         Interface(tmp_path, host=host, port=1).check()
     other = OtherDoor("--secop", "127.0.0.1", 1, lambda *_: asyncio.sleep(0))
     Interface(tmp_path, doors=(other,)).check()
-    Interface(tmp_path, tokens={"rose": TOKEN}, doors=(other,), trusts_loopback=True).check()
+    Interface(tmp_path, tokens=book(), doors=(other,), trusts_loopback=True).check()
     with pytest.raises(ConfigError, match=r"--secop: .* set interface\.trust_loopback: true"):
-        Interface(tmp_path, tokens={"rose": TOKEN}, doors=(other,)).check()
-    assert TOKEN not in repr(Interface(tmp_path, tokens={"rose": TOKEN}))
+        Interface(tmp_path, tokens=book(), doors=(other,)).check()
+    assert TOKEN not in repr(Interface(tmp_path, tokens=book()))
 
 
 async def test_a_port_that_is_taken_is_said_to(tmp_path: Path):

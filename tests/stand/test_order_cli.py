@@ -10,7 +10,7 @@ from stand.commands.command_table import app as stand
 from stand.commands.order_cli import app
 from stand.serving.api.doors import Interface
 from tests.stand.a_desk import ADesk, served
-from tests.stand.test_interface_access import free_port
+from tests.stand.test_interface_access import book, free_port
 
 TOKEN = "correct-horse-battery-staple"
 
@@ -36,7 +36,7 @@ async def test_a_run_is_begun_at_an_address_and_what_is_of_this_machine_is_refus
     port, token = free_port(), tmp_path / "token"
     token.write_text(TOKEN)
     there = ["--url", f"http://127.0.0.1:{port}", "--token-file", str(token), "--detach"]
-    async with served(ADesk(), tmp_path / "sessions", Interface(tmp_path, port=port, tokens={"rose": TOKEN})) as desk:
+    async with served(ADesk(), tmp_path / "sessions", Interface(tmp_path, port=port, tokens=book())) as desk:
         begun = await asyncio.to_thread(CliRunner().invoke, stand, ["run", "demo", *there])
         assert begun.stdout == "run 1 is queued; `stand status` follows it\n"
         refused = await asyncio.to_thread(CliRunner().invoke, stand, ["run", "demo", *there, "--seed", "0"])
@@ -47,7 +47,7 @@ async def test_a_run_is_begun_at_an_address_and_what_is_of_this_machine_is_refus
 async def test_a_device_is_commanded_over_the_network(tmp_path: Path):
     port, token = free_port(), tmp_path / "token"
     token.write_text(TOKEN)
-    interface = Interface(tmp_path, port=port, tokens={"rose": TOKEN})
+    interface = Interface(tmp_path, port=port, tokens=book())
     async with served(ADesk(), tmp_path / "sessions", interface) as desk:
         there = ("--url", f"http://127.0.0.1:{port}", "--token-file", token)
         assert (await invoke("device", *there)).stdout == "flap (flap)\n"

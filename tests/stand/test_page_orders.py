@@ -302,3 +302,24 @@ async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(nigh
         await page.get_by_role("heading", name="What wears").wait_for()
         await page.get_by_role("button", name="Open", exact=True).wait_for()
         assert await page.get_by_role("heading", name="Faults on purpose").count() == 0
+
+
+async def test_who_may_only_look_is_told_so_and_orders_nothing_but_stop(night):
+    async with a_page(night.chromium, night.port) as page:
+        await page.get_by_text("Running", exact=True).wait_for()
+        known = {"name": "wall", "how": "token", "read_only": True}
+        await page.route("**/api/v1/who", lambda route: route.fulfill(json=known))
+        await page.reload()
+        await page.get_by_text("The token of wall may look and press STOP").wait_for()
+        night.trip()
+        await page.get_by_role("button", name="Look at it and clear").click()
+        for view in VIEWS:
+            await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
+            await page.wait_for_timeout(200)
+            orders = page.locator("[data-order]")
+            assert await orders.count() == await page.locator("[data-order]:disabled[title*=wall]").count()
+            assert view != "plan" or await orders.count() > 5
+        assert await page.get_by_role("button", name="The cause is removed").is_disabled()
+        await page.locator("#stop").click()
+        await until(lambda: night.stops)
+    assert [verb for _, verb, _ in night.orders] == ["stop"]

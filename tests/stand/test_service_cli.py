@@ -37,6 +37,7 @@ def test_the_unit_starts_the_daemon_and_gives_it_time_to_make_safe(tmp_path: Pat
     assert command[1:] == ["-m", "stand.cli", "serve", str(CONFIG.absolute()), "--port", "8080"]
     assert unit["Service"]["User"] == "operator"
     assert int(unit["Service"]["WatchdogSec"]) == 60
+    assert unit["Service"]["ExecReload"] == "/bin/kill -HUP $MAINPID"
     rules = (tmp_path / "etc/udev/rules.d/60-thermostand.rules").read_text()
     assert 'ATTR{idVendor}=="1ffb", OWNER="operator"' in rules
     assert 'SYMLINK+="ximc/%s{serial}"' in rules

@@ -9,7 +9,7 @@ from typer.testing import CliRunner, Result
 
 from foundation.errors import ConfigError
 from stand.commands.token_cli import app
-from stand.config.interface_section import load_tokens, write_tokens
+from stand.config.interface_section import TokenFile, load_tokens, write_tokens
 from stand.config.stand_config import load_config, packaged
 
 TOKEN = "correct-horse-battery-staple"
@@ -35,26 +35,38 @@ def test_a_token_is_made_listed_known_and_taken_back(config: Path):
     path = load_config(config).interface.secrets
     assert path is not None
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert load_tokens(path) == {"rose": token}
+    assert load_tokens(path) == TokenFile(tokens={"rose": token})
     assert "has a token already" in invoke("add", "rose", "--config", config).stderr
     assert invoke("add", "<script>", "--config", config).exit_code == 2
     assert invoke("add", "li.wei@home", "--config", config).exit_code == 0
-    assert invoke("list", "--config", config).stdout == "li.wei@home\nrose\n"
-    assert invoke("remove", "rose", "--config", config).exit_code == 0
+    assert invoke("add", "wall", "--read-only", "--config", config).exit_code == 0
+    assert "has a token already" in invoke("add", "wall", "--config", config).stderr
+    assert invoke("list", "--config", config).stdout == "li.wei@home\nrose\nwall  read-only\n"
+    removed = invoke("remove", "rose", "--config", config)
+    assert (removed.exit_code, "SIGHUP" in removed.stderr) == (0, True)
     assert "has no token" in invoke("remove", "rose", "--config", config).stderr
-    assert list(load_tokens(path)) == ["li.wei@home"]
+    assert invoke("remove", "li.wei@home", "--config", config).exit_code == 0
+    left = load_tokens(path)
+    assert (left.tokens, list(left.read_only)) == ({}, ["wall"])
 
 
 def test_without_a_file_in_the_configuration_it_is_said_where_to_name_one():
     reported = invoke("add", "rose")
     assert reported.exit_code == 2
     assert "has no interface.secrets" in reported.stderr
-    assert load_tokens(None) == {}
 
 
 @pytest.mark.parametrize(
     "content",
-    [f"tokens: {{rose: short{TOKEN[:5]}}}", f"tokens: [{TOKEN}]", f"tokens: {{rose: [{TOKEN}]}}", f"- {TOKEN}"],
+    [
+        f"tokens: {{rose: short{TOKEN[:5]}}}",
+        f"tokens: [{TOKEN}]",
+        f"tokens: {{rose: [{TOKEN}]}}",
+        f"- {TOKEN}",
+        f"tokens: {{rose: {TOKEN}}}\nread_only: {{rose: {TOKEN}s}}",
+        f"tokens: {{rose: {TOKEN}}}\nread_only: {{wall: {TOKEN}}}",
+        f"read_olny: {{wall: {TOKEN}}}",
+    ],
 )
 def test_what_is_wrong_in_the_file_is_said_without_a_word_of_it(tmp_path: Path, content: str):
     path = tmp_path / "tokens.yaml"
@@ -67,8 +79,8 @@ def test_what_is_wrong_in_the_file_is_said_without_a_word_of_it(tmp_path: Path, 
 
 def test_a_file_that_others_may_read_is_refused(tmp_path: Path):
     path = tmp_path / "tokens.yaml"
-    write_tokens(path, {"rose": TOKEN})
-    assert load_tokens(path) == {"rose": TOKEN}
+    write_tokens(path, TokenFile(tokens={"rose": TOKEN}))
+    assert load_tokens(path) == TokenFile(tokens={"rose": TOKEN})
     path.chmod(0o640)
     with pytest.raises(ConfigError, match="others may read or write it"):
         load_tokens(path)

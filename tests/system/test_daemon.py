@@ -44,7 +44,8 @@ class Served:
 
     def __init__(self, config_file: Path, out: Path) -> None:
         self.out = out
-        command = [sys.executable, "-m", "stand.cli", "serve", str(config_file), "--out", str(out), "--no-reports"]
+        arguments = ["--config", str(config_file), "--out", str(out), "--no-reports"]
+        command = [sys.executable, "-m", "stand.cli", "serve", *arguments]
         self.process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     @property
@@ -151,12 +152,15 @@ def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(s
     counters = served.state().counters
     assert counters["flap_cycles"] >= 1
     assert counters["stage_cycles.linear"] >= 1
+    served.process.send_signal(signal.SIGHUP)  # it has no tokens to be read again
+    assert served.server.request("GET", "/api/v1/state")
     served.process.send_signal(signal.SIGTERM)
     reported = served.reported()
     assert served.process.returncode == 0, reported
     (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
     session = Session.open(folder)
     assert session.incomplete == ()
+    assert any(event.kind == "tokens_not_read" for event in session.events())
     assert any(event.kind == "command" and event.data.get("verb") == "device" for event in session.events())
     assert len(list(session.frames())) == 1
     for name in ("brief", "other"):

@@ -3,9 +3,11 @@
 - Host: the names of this stand only, also on loopback: a page of another site must not reach it under a name of its
   own that leads here (DNS rebinding).
 - Origin: what changes something, and the stream, is taken from the stand's own page or from what is no browser.
-- Token: for everything that does not come through the Unix socket, which proves who asks. Where the stand has no
-  tokens, or its file trusts loopback, this machine needs none: a proxy on it that adds no header makes everybody local.
+- Token: for everything that does not come through the Unix socket, which proves who asks. Where the stand's file names
+  no tokens, or trusts loopback, this machine needs none: a proxy on it that adds no header makes everybody local.
+- A read-only token may look: whatever is not asked by GET is refused, but for STOP and for what changes nothing.
 - STOP needs no token and is never delayed; it keeps the checks of Host and Origin.
+- A token that is taken back ends the streams that it has opened, and the logins that it was for.
 - Sizes and times of bodies are limited, and answers carry what a browser needs to be strict with them.
 """
 
@@ -19,13 +21,16 @@ import pwd
 import secrets
 import socket
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
-from dataclasses import dataclass, field
-from typing import Any, cast
+from collections.abc import Awaitable, Callable, Iterable, MutableMapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
+from stand.config.interface_section import TokenFile
 from stand.serving.api.pace import Pace
 from stand.serving.api.stream import json_of
+from stand.serving.api.token_book import TokenBook
 from stand.serving.desk import Who
 
 Scope = MutableMapping[str, Any]
@@ -35,7 +40,9 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 STOP_PATH = "/api/v1/run/stop"
-LOGIN_PATH = "/login"
+LOGIN_PATH, INVITE_PATH = "/login", "/api/v1/login"
+CHECK_PATH = "/api/v1/run/plan/check"
+_CHANGES_NOTHING = frozenset({STOP_PATH, INVITE_PATH, CHECK_PATH})
 COOKIE = "thermostand"
 BODY_LIMIT_BYTES = 1 << 20
 _BODY_LIMIT_S = 10.0
@@ -69,41 +76,51 @@ class Denied(Exception):
         self.status = status
 
 
+@dataclass(frozen=True, slots=True)
+class _Login:
+    """of: the token that has asked for it, None for none: then it was this machine's user."""
+
+    who: Who
+    of: tuple[str, bool] | None = field(repr=False)
+    until_s: float
+
+
 @dataclass
 class Access:
-    """tokens: by name. hosts: names under which the stand is reached besides this machine's own. Logins are one-time
-    codes and what became of them: both live as long as the daemon."""
+    """hosts: names under which the stand is reached besides this machine's own. Logins are one-time codes and what
+    became of them: both live as long as the daemon, and no longer than the token that asked for them."""
 
-    tokens: Mapping[str, str] = field(default_factory=dict[str, str])
+    tokens: TokenBook = field(default_factory=TokenBook)
     hosts: Iterable[str] = ()
-    trusts_loopback: bool = False
+    trusts_loopback: bool | Literal["read-only"] = False
 
     def __post_init__(self) -> None:
         names = {socket.gethostname().lower(), *(host.lower() for host in self.hosts)}
         self._names = frozenset(names | _LOOPBACK)
-        self._hashes = {name: _hash(token) for name, token in self.tokens.items()}
-        self._codes: dict[str, tuple[str, float]] = {}
-        self._logins: dict[str, tuple[str, float]] = {}
+        self._codes: dict[str, _Login] = {}
+        self._logins: dict[str, _Login] = {}
 
-    def login_code(self, name: str) -> str:
-        """A code that opens the page once, within ten minutes, for the holder of that name."""
+    def login_code(self, who: Who, *, read_only: bool = False) -> str:
+        """A code that opens the page once, within ten minutes, for who asks for it, or for one who may only look."""
         now_s = time.monotonic()
-        self._codes = {code: entry for code, entry in self._codes.items() if entry[1] > now_s}
+        self._codes = {code: entry for code, entry in self._codes.items() if entry.until_s > now_s}
         while len(self._codes) >= _MOST_LOGINS:
             del self._codes[next(iter(self._codes))]
         code = secrets.token_urlsafe(24)
-        self._codes[_hash(code)] = name, now_s + _LOGIN_S
+        holder = Who(name=who.name, how="token", read_only=who.read_only or read_only)
+        of = self._token(who.name) if who.how == "token" else None
+        self._codes[_hash(code)] = _Login(holder, of, now_s + _LOGIN_S)
         return code
 
     def log_in(self, code: str) -> str:
         """The cookie of who has the code, which is worth nothing from now on; "" when it is none."""
-        name, until_s = self._codes.pop(_hash(code), ("", 0.0))
-        if time.monotonic() > until_s:
+        login = self._codes.pop(_hash(code), None)
+        if login is None or not self._holds(login):
             return ""
         while len(self._logins) >= _MOST_LOGINS:
             del self._logins[next(iter(self._logins))]
         cookie = secrets.token_urlsafe(32)
-        self._logins[_hash(cookie)] = name, time.monotonic() + _SESSION_S
+        self._logins[_hash(cookie)] = replace(login, until_s=time.monotonic() + _SESSION_S)
         return cookie
 
     def who(self, scope: Scope) -> Who | None:
@@ -111,11 +128,13 @@ class Access:
         state, headers = cast("dict[str, Any]", scope.get("state") or {}), cast("Headers", scope["headers"])
         if state.get("door") == "socket":
             return Who(name=user_name(state.get("uid")), how="socket")
-        name = self._named(headers)
-        if name is not None:
-            return Who(name=name, how="token")
-        needs_token = bool(self._hashes) and not self.trusts_loopback
-        return Who(name="", how="loopback") if not needs_token and _is_local(scope, headers) else None
+        found = self._of_token(headers) or self._of_cookie(headers)
+        if found is not None:
+            return found
+        needs_token = self.tokens.known is not None and not self.trusts_loopback
+        if needs_token or not _is_local(scope, headers):
+            return None
+        return Who(name="", how="loopback", read_only=self.trusts_loopback == "read-only")
 
     def check(self, scope: Scope) -> None:
         """Host and Origin; Denied."""
@@ -126,7 +145,7 @@ class Access:
         if scope["type"] == "http" and scope["method"] in _READS:
             return
         origins = _all(headers, b"origin")
-        if any(not _is_same(origin, host) for origin in origins) or _one(headers, b"sec-fetch-site") == "cross-site":
+        if any(not _is_same(origin, host) for origin in origins) or "cross-site" in _all(headers, b"sec-fetch-site"):
             raise Denied(403, "this is not done for the page of another site")
 
     def _knows(self, scope: Scope, host: str) -> bool:
@@ -140,18 +159,32 @@ class Access:
         server = scope.get("server")
         return bool(server) and str(ip) == str(server[0]).partition("%")[0]  # an address cannot be rebound
 
-    def _named(self, headers: Headers) -> str | None:
-        given = _one(headers, b"authorization")
-        if given is not None:
-            kind, _, token = given.partition(" ")
-            found = _hash(token.strip())
-            matches = [name for name, known in self._hashes.items() if hmac.compare_digest(known, found)]
-            if kind.lower() != "bearer" or not matches:
-                raise Denied(401, "the Authorization header has no token of this stand")
-            return matches[0]
+    def _of_token(self, headers: Headers) -> Who | None:
+        given = _all(headers, b"authorization")
+        if not given:
+            return None
+        kind, _, token = given[0].partition(" ")
+        found, known = _hash(token.strip()), self.tokens.known or TokenFile()
+        matches = [
+            Who(name=name, how="token", read_only=read_only)
+            for name, (each, read_only) in known.by_name().items()
+            if hmac.compare_digest(_hash(each), found)
+        ]
+        if len(given) > 1 or kind.lower() != "bearer" or not matches:
+            raise Denied(401, "the Authorization header has no token of this stand")
+        return matches[0]
+
+    def _of_cookie(self, headers: Headers) -> Who | None:
         cookie = next((value for name, value in _cookies(headers) if name == COOKIE), None)
-        name, until_s = self._logins.get(_hash(cookie), ("", 0.0)) if cookie else ("", 0.0)
-        return name if time.monotonic() < until_s else None
+        login = self._logins.get(_hash(cookie)) if cookie else None
+        return login.who if login is not None and self._holds(login) else None
+
+    def _holds(self, login: _Login) -> bool:
+        return time.monotonic() < login.until_s and login.of in (None, self._token(login.who.name))
+
+    def _token(self, name: str) -> tuple[str, bool] | None:
+        """That of a name, and whether it is read-only."""
+        return (self.tokens.known or TokenFile()).by_name().get(name)
 
 
 Headers = Iterable[tuple[bytes, bytes]]
@@ -246,6 +279,16 @@ class Gatekeeper:
         self._access = access
         self._pace = pace
         self._failed = failed
+        self._viewers: dict[asyncio.Task[object], Scope] = {}
+        access.tokens.watch(self._look_at_viewers)
+
+    def _look_at_viewers(self) -> None:
+        """Those who would not be let in any more have to leave."""
+        for task, scope in self._viewers.items():
+            with suppress(Denied):
+                if self._access.who(scope) is not None:
+                    continue
+            task.cancel()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request, or one viewer."""
@@ -257,13 +300,18 @@ class Gatekeeper:
             who = self._access.who(scope)
             if who is None and not is_open(scope["path"]):
                 raise Denied(401, "this needs a token: an Authorization header, or the address of `stand token login`")
-            scope["state"] = {**(scope.get("state") or {}), "who": who or Who(name="", how="token")}
+            if who is not None and who.read_only and _may_change(scope):
+                raise Denied(403, f"{_whose(who)} may look and press STOP, but order nothing: it is read-only")
+            scope["state"] = {**(scope.get("state") or {}), "who": who or Who(name="", how="network")}
             if scope.get("method") == "HEAD":  # as GET; uvicorn sends the head of its answer only
                 scope = {**scope, "method": "GET"}
             if scope["type"] == "http" and scope["path"] != STOP_PATH:
                 await self._pace.turn()
                 receive = await _whole_body(scope, receive)
-            await self._app(scope, receive, answering)
+            if scope["type"] == "websocket":
+                await self._view(scope, receive, answering)
+            else:
+                await self._app(scope, receive, answering)
         except Denied as denied:
             await _refuse(scope, answering, denied.status, str(denied))
         except Exception as error:  # noqa: BLE001 - after a request that fails, the next must be answered
@@ -271,6 +319,20 @@ class Gatekeeper:
             await _refuse(scope, answering, 500, f"failed ({type(error).__name__}); the stand's events say more")
         finally:
             self._pace.spent()
+
+    async def _view(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """As long as its token is known; Denied when that is taken back."""
+        viewing = asyncio.ensure_future(self._app(scope, receive, send))
+        self._viewers[viewing] = scope
+        try:
+            await asyncio.wait([viewing])
+        finally:
+            del self._viewers[viewing]
+            is_over = viewing.done()
+            viewing.cancel()
+        if is_over and viewing.cancelled():
+            raise Denied(401, "the token was taken back")
+        viewing.result()
 
 
 class _Answering:
@@ -293,6 +355,14 @@ class _Answering:
             message = {**message, "headers": [*own, *added]}
         self.has_begun = self.has_begun or message["type"] != "http.response.body"
         await self._send(message)
+
+
+def _may_change(scope: Scope) -> bool:
+    return scope["type"] == "http" and scope["method"] not in _READS and scope["path"] not in _CHANGES_NOTHING
+
+
+def _whose(who: Who) -> str:
+    return f"the token of {who.name}" if who.how == "token" else "this machine, without a token,"
 
 
 def _is_in_chunks(scope: Scope) -> bool:
@@ -335,11 +405,13 @@ async def _whole_body(scope: Scope, receive: Receive) -> Receive:
 
 
 async def _refuse(scope: Scope, send: _Answering, status: int, sentence: str) -> None:
-    if send.has_begun:
+    if send.has_begun and scope["type"] == "http":
         return
     prefix = "http" if scope["type"] == "http" else "websocket.http"
-    if scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
-        await send({"type": "websocket.close", "code": 1008, "reason": sentence})
+    is_refused_by_http = "websocket.http.response" in scope.get("extensions", {}) and not send.has_begun
+    if scope["type"] == "websocket" and not is_refused_by_http:
+        with suppress(RuntimeError):  # it is closed
+            await send({"type": "websocket.close", "code": 1008, "reason": sentence})
         return
     body = json_of({"error": sentence}).encode()
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]

@@ -6,12 +6,13 @@ import socket
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from foundation.errors import ConfigError
 from stand.serving.api.access import is_loopback
 from stand.serving.api.bridge import Bridge
 from stand.serving.api.pace import Pace
+from stand.serving.api.token_book import TokenBook
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,18 +30,18 @@ class OtherDoor:
 class Interface:
     """How a stand is reached besides its Unix socket.
 
-    host, port: to listen at by TCP; no port, no TCP. tokens: by name. hosts: names of this stand besides this machine's
-    own. trusts_loopback: whoever asks from this machine needs no token, though there are some. doors: other protocols'
-    ports. sessions: the folder of recorded sessions. rooms: makes what else is served (history, frames, the page) in
-    the thread, as routers, by the bridge.
+    host, port: to listen at by TCP; no port, no TCP. hosts: names of this stand besides this machine's own.
+    trusts_loopback: as `trust_loopback` of the stand's file. doors: other protocols' ports. sessions: the folder of
+    recorded sessions. rooms: makes what else is served (history, frames, the page) in the thread, as routers, by the
+    bridge.
     """
 
     sessions: Path
     host: str = "127.0.0.1"
     port: int | None = None
-    tokens: dict[str, str] = field(default_factory=dict[str, str], repr=False)
+    tokens: TokenBook = field(default_factory=TokenBook)
     hosts: tuple[str, ...] = ()
-    trusts_loopback: bool = False
+    trusts_loopback: bool | Literal["read-only"] = False
     doors: tuple[OtherDoor, ...] = ()
     rooms: Sequence[Callable[[Bridge], Any]] = ()
 
@@ -55,12 +56,13 @@ class Interface:
     def check(self) -> None:
         """ConfigError when everybody on the network could operate the stand, or a port asks for no token where others
         do."""
-        if self.tokens and self.doors and not self.trusts_loopback:
+        if self.tokens.known is not None and self.doors and not self.trusts_loopback:
             raise ConfigError(
                 f"{self.doors[0].option}: this protocol has no tokens, and this stand asks for one; set "
-                "interface.trust_loopback: true in its file if every program of this machine may operate it"
+                "interface.trust_loopback: true in its file if every program of this machine may operate it, "
+                "or read-only if it may look"
             )
-        if self.port is not None and not self.tokens and not is_loopback(self.host):
+        if self.port is not None and self.tokens.known is None and not is_loopback(self.host):
             raise ConfigError(
                 f"--host {self.host}: others on the network could operate this stand; make a token with "
                 "`stand token add NAME`, or listen at 127.0.0.1"

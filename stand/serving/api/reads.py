@@ -11,11 +11,12 @@ from pydantic import BaseModel
 from starlette.websockets import WebSocketDisconnect
 
 from experiments.steps import schema_of_steps
-from stand.serving.api.access import COOKIE, LOGIN_PATH, Access
+from foundation.documents import Document
+from stand.serving.api.access import COOKIE, INVITE_PATH, LOGIN_PATH, Access
 from stand.serving.api.bridge import Bridge, NoAnswer
 from stand.serving.api.metrics import metrics
 from stand.serving.api.stream import EVENTS, MOST_VIEWERS, Stream, json_of
-from stand.serving.desk import PlanStep, StandState
+from stand.serving.desk import PlanStep, StandState, Who
 
 _OLD_S = 10.0  # a snapshot is made twice a second: the control loop hangs
 _SEND_LIMIT_S = 30.0
@@ -34,6 +35,12 @@ class Health(BaseModel):
     ok: bool
     age_s: float
     error: str = ""
+
+
+class LoginRequest(Document):
+    """read_only: for somebody who may only look and press STOP."""
+
+    read_only: bool = False
 
 
 class Invitation(BaseModel):
@@ -129,10 +136,16 @@ def _add_logins(router: APIRouter, access: Access, url: str) -> None:
         answer.set_cookie(COOKIE, cookie, max_age=30 * 86400, httponly=True, samesite="strict", path="/")
         return answer
 
-    @router.post("/api/v1/login", response_model=Invitation)
-    async def invite(request: Request) -> Response:
-        """A one-time path that opens the page on another machine; for the Unix socket and holders of a token."""
-        path = f"{LOGIN_PATH}?once={access.login_code(request.state.who.name)}"
+    @router.get("/api/v1/who", response_model=Who)
+    async def who(request: Request) -> Response:
+        """As whom the stand knows you, and whether you may only look."""
+        return _json(request.state.who.model_dump_json())
+
+    @router.post(INVITE_PATH, response_model=Invitation)
+    async def invite(request: Request, body: LoginRequest | None = None) -> Response:
+        """A one-time path that opens the page on another machine, with the rights of who asks at most."""
+        code = access.login_code(request.state.who, read_only=body is not None and body.read_only)
+        path = f"{LOGIN_PATH}?once={code}"
         return _json(json_of({"path": path, "url": f"{url}{path}" if url else ""}))
 
 
@@ -158,8 +171,8 @@ async def _follow(socket: WebSocket, stream: Stream, after: int | None) -> None:
         for task in tasks:
             task.cancel()
         ends = await asyncio.gather(*tasks, return_exceptions=True)
-        with suppress(Exception):
-            await socket.close()
+    with suppress(Exception):
+        await socket.close()
     for end in ends:
         if isinstance(end, Exception) and not isinstance(
             end, WebSocketDisconnect | TimeoutError | RuntimeError | KeyError

@@ -50,7 +50,7 @@ export class Devices {
       event.preventDefault();
       const given = Object.fromEntries(inputs.map(({ name, value }) => [name, value()]).filter(([, value]) => value !== undefined));
       command(answer, verb.text || words(verb.verb), "POST", `/devices/${encodeURIComponent(device.name)}/${encodeURIComponent(verb.verb)}`, { arguments: given });
-    } }, inputs.map(({ label }) => label), h("button", { type: "submit" }, verb.text || words(verb.verb)));
+    } }, inputs.map(({ label }) => label), h("button", { type: "submit", "data-order": "" }, verb.text || words(verb.verb)));
   }
 
   input(argument) {

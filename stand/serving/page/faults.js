@@ -11,7 +11,7 @@ export class Faults {
     this.answer = h("p", { class: "answer", role: "status" });
     this.standing = h("ul", { class: "standing" });
     const form = h("form", { class: "row", onsubmit: (event) => { event.preventDefault(); this.break_it(); } }, this.name,
-      h("label", {}, "value ", this.value), h("label", {}, "for ", this.for_s, h("small", {}, " s, or until mended")), h("button", { type: "submit" }, "break"));
+      h("label", {}, "value ", this.value), h("label", {}, "for ", this.for_s, h("small", {}, " s, or until mended")), h("button", { type: "submit", "data-order": "" }, "break"));
     fill(place, h("h2", {}, "Faults on purpose"), h("p", { class: "quiet" }, "In the simulated laboratory, also in a run; each is recorded."), form, this.text, this.answer, this.standing);
   }
 
@@ -27,7 +27,7 @@ export class Faults {
     const shape = JSON.stringify(known.standing);
     if (shape === this.shape) return;
     this.shape = shape;
-    fill(this.standing, Object.entries(known.standing).map(([name, value]) => h("li", {}, `${name} = ${JSON.stringify(value)} `, h("button", { type: "button", "aria-label": `mend ${name}`, onclick: () => this.order(`mend ${name}`, { name, mend: true }) }, "mend"))));
+    fill(this.standing, Object.entries(known.standing).map(([name, value]) => h("li", {}, `${name} = ${JSON.stringify(value)} `, h("button", { type: "button", "data-order": "", "aria-label": `mend ${name}`, onclick: () => this.order(`mend ${name}`, { name, mend: true }) }, "mend"))));
   }
 
   describe() {

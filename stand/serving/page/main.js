@@ -9,6 +9,7 @@ import { Queue } from "./queue.js";
 import { Sessions } from "./sessions.js";
 import { arm } from "./stop.js";
 import { follow } from "./stream.js";
+import { look_who } from "./looking.js";
 
 const VIEWS = { now: Now, plan: Plan, queue: Queue, camera: CameraView, sessions: Sessions, devices: Devices };
 const PHASE = { idle: "Idle", by_hand: "Heat by hand", running: "Running", held: "Held", stopping: "Stopping", tripped: "Tripped", lost: "No connection" };
@@ -68,9 +69,13 @@ function lost() {
   say(at("phase"), PHASE.lost);
   const since = app.state ? `What is shown is of ${clock(seconds(app.state.now_ns, app.state.utc_offset_ns), true)}. ` : "";
   notices.lost(`${since}Trying again. The stand guards itself; to stop it now, press STOP or its emergency stop.`);
+  look();
 }
 
+const look = () => look_who((text) => notices.looks(text));
+
 arm(at("stop"), notices, app);
+look();
 addEventListener("hashchange", open);
 document.addEventListener("visibilitychange", () => { if (!document.hidden) app.view?.soon?.(); });
 open();
@@ -84,6 +89,7 @@ follow({
     app.is_lost = false;
     document.body.classList.remove("lost");
     notices.lost("");
+    look();
     setTimeout(() => app.view.soon?.(), 300);
   },
 });

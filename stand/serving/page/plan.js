@@ -15,10 +15,10 @@ export class Plan {
     this.steps = [];
     this.answer = h("p", { class: "answer", role: "status" });
     this.buttons = h("div", { class: "row" },
-      this.pause = h("button", { type: "button", onclick: () => this.order("pause", { when: "now" }, "pause") }, "Pause now"),
-      this.pause_step = h("button", { type: "button", onclick: () => this.pause_after() }, "Pause after this step"),
-      this.go = h("button", { type: "button", class: "main", onclick: () => this.order("continue", undefined, "continue") }, "Continue"),
-      this.edit_button = h("button", { type: "button", onclick: () => this.edit() }, "Edit the steps to come …"),
+      this.pause = h("button", { type: "button", "data-order": "", onclick: () => this.order("pause", { when: "now" }, "pause") }, "Pause now"),
+      this.pause_step = h("button", { type: "button", "data-order": "", onclick: () => this.pause_after() }, "Pause after this step"),
+      this.go = h("button", { type: "button", "data-order": "", class: "main", onclick: () => this.order("continue", undefined, "continue") }, "Continue"),
+      this.edit_button = h("button", { type: "button", "data-order": "", onclick: () => this.edit() }, "Edit the steps to come …"),
       this.abort = h("button", { type: "button", class: "danger", onclick: () => this.end() }, "End the run …"));
     this.summary = h("p", {});
     this.line = h("canvas", { class: "line", role: "img", "aria-label": "Time line of the plan" });
@@ -88,7 +88,7 @@ export class Plan {
   row(step) {
     const is_open = step.standing === "waiting" || step.standing === "under_way";
     const acts = h("span", { class: "acts" });
-    const button = (name, act) => acts.append(h("button", { type: "button", class: "small", "data-key": `${step.step_id} ${name}`, "aria-label": `${name}: step ${step.index + 1}`, onclick: act }, name));
+    const button = (name, act) => acts.append(h("button", { type: "button", class: "small", "data-order": "", "data-key": `${step.step_id} ${name}`, "aria-label": `${name}: step ${step.index + 1}`, onclick: act }, name));
     const row = h("li", { "data-standing": step.standing },
       h("span", { title: WORD[step.standing] }, h("span", { "aria-hidden": "true" }, SIGN[step.standing]), h("span", { class: "unseen" }, WORD[step.standing])),
       h("span", { class: "index number quiet" }, String(step.index + 1)),

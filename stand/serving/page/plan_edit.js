@@ -26,7 +26,7 @@ export class PlanEdit {
       this.kept.length ? h("p", { class: "quiet" }, `${this.kept.length} more steps behind these stay as they are.`) : null,
       h("div", { class: "row" }, this.kind, h("button", { type: "button", onclick: () => this.add() }, "Add this step at the end")),
       this.whole,
-      h("div", { class: "row" }, h("button", { type: "button", class: "main", onclick: () => this.replace() }, "Use these steps"), h("button", { type: "button", onclick: () => this.close() }, "Keep the plan"))));
+      h("div", { class: "row" }, h("button", { type: "button", class: "main", "data-order": "", onclick: () => this.replace() }, "Use these steps"), h("button", { type: "button", onclick: () => this.close() }, "Keep the plan"))));
     this.show();
     this.head.focus();
     this.check();

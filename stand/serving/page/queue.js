@@ -22,7 +22,7 @@ export class Queue {
     this.tags = h("input", { type: "text", id: "tags", maxlength: 300, size: 24, placeholder: "lens-a, after-service" });
     this.parameters = h("fieldset", { class: "bare", disabled: true });
     this.details = h("details", {}, h("summary", {}, "Look at and change its parameters"), this.parameters);
-    this.start = h("button", { type: "submit", class: "main" }, "Add to the queue");
+    this.start = h("button", { type: "submit", class: "main", "data-order": "" }, "Add to the queue");
     this.asked = 0;
     const form = h("form", { class: "fields", onsubmit: (event) => { event.preventDefault(); this.submit(); } },
       h("div", { class: "field" }, h("label", { for: "recipe" }, "recipe"), this.choice),
@@ -110,7 +110,7 @@ export class Queue {
   row(run, movable) {
     const at = movable.indexOf(run), offset_ns = this.app.state.utc_offset_ns;
     const acts = h("span", { class: "row" });
-    const button = (name, label, act, disabled = false) => acts.append(h("button", { type: "button", class: "small", "data-resume": name === "Resume", "aria-label": `${label}: run ${run.id}`, disabled, onclick: act }, name));
+    const button = (name, label, act, disabled = false) => acts.append(h("button", { type: "button", class: "small", "data-order": "", "data-resume": name === "Resume", "aria-label": `${label}: run ${run.id}`, disabled, onclick: act }, name));
     const row = h("li", { draggable: at >= 0 ? "true" : undefined }, h("span", { class: "number quiet" }, String(run.id)),
       h("span", {}, h("b", {}, run.recipe), ` ${run.state}`, time_of(run),
         h("br"), h("small", {}, [run.reason, run.added_by && `by ${run.added_by}`, `added ${day_clock(seconds(run.added_ns, offset_ns))}`, run.session].filter(Boolean).join(" · "))), acts);

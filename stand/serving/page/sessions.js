@@ -55,8 +55,8 @@ export class Sessions {
     const took = each.begin_ns && each.end_ns ? duration((each.end_ns - each.begin_ns) / 1e9) : "–";
     const path = encodeURIComponent(each.name), actions = h("span", { class: "row" });
     if (each.has_report) actions.append(h("a", { href: `/api/v1/sessions/${path}/report.html`, target: "_blank", rel: "noopener" }, "report"));
-    if (RESUMABLE.includes(each.run)) actions.append(h("button", { type: "button", class: "small", "data-resume": "", "aria-label": `Resume ${each.name}`, onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
-    actions.append(h("button", { type: "button", class: "small", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
+    if (RESUMABLE.includes(each.run)) actions.append(h("button", { type: "button", class: "small", "data-order": "", "data-resume": "", "aria-label": `Resume ${each.name}`, onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
+    actions.append(h("button", { type: "button", class: "small", "data-order": "", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
     const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
     return h("tr", {}, h("td", {}, box),
       h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)]),
@@ -72,7 +72,7 @@ export class Sessions {
     const form = h("form", { class: "row", onsubmit: async (event) => {
       event.preventDefault();
       if (await command(this.answer, "note", "POST", `/sessions/${encodeURIComponent(each.name)}/notes`, { text: input.value })) { form.remove(); this.load(); }
-    } }, input, h("button", { type: "submit", class: "small" }, "Keep"));
+    } }, input, h("button", { type: "submit", class: "small", "data-order": "" }, "Keep"));
     place.append(form);
     input.focus();
   }

@@ -42,11 +42,11 @@ _NO_DESCRIPTOR_S = 0.1
 _FAREWELL_S = 1.0
 
 
-def door_at(port: int) -> OtherDoor:
-    """The node's door, for this machine only."""
+def door_at(port: int, *, read_only: bool = False) -> OtherDoor:
+    """The node's door, for this machine only. read_only: who comes may look, and order nothing but STOP."""
 
     async def serve(listening: socket.socket, bridge: Bridge, pace: Pace, failed: Callable[[Exception], None]) -> None:
-        await Door(listening, bridge, pace, failed).run()
+        await Door(listening, bridge, pace, failed, read_only=read_only).run()
 
     return OtherDoor("--secop", HOST, port, serve)
 
@@ -55,9 +55,16 @@ class Door:
     """Serves the node at a listening socket until cancelled. `failed` is called with errors that should not happen."""
 
     def __init__(
-        self, listening: socket.socket, bridge: Bridge, pace: Pace, failed: Callable[[Exception], None]
+        self,
+        listening: socket.socket,
+        bridge: Bridge,
+        pace: Pace,
+        failed: Callable[[Exception], None],
+        *,
+        read_only: bool = False,
     ) -> None:
         self._listening = listening
+        self._read_only = read_only
         self._bridge = bridge
         self._pace = pace
         self._failed = failed
@@ -68,7 +75,7 @@ class Door:
         """Until cancelled."""
         devices = await self._bridge.ask(lambda desk: desk.devices())
         self._listening.setblocking(False)
-        node = Node(self._bridge, devices, self._tell, self._failed)
+        node = Node(self._bridge, devices, self._tell, self._failed, read_only=self._read_only)
         looking = asyncio.create_task(self._look(node))
         try:
             await self._accept(node)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from pydantic import JsonValue
@@ -136,6 +136,10 @@ class Module:
     device: str = ""
     read_ns: Callable[[StandState], int] = lambda state: state.now_ns
     is_read_after: bool = False
+
+    def looked_at(self) -> Module:
+        """The same, of which nothing can be changed."""
+        return replace(self, parameters={name: replace(each, change=None) for name, each in self.parameters.items()})
 
     def described(self) -> dict[str, object]:
         """For the node's description."""

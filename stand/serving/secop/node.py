@@ -59,7 +59,7 @@ class _Reported:
 
 class Node:
     """Of a stand with these devices. `tell` is given each parameter that has changed, with the line that says so;
-    `failed` what should not happen."""
+    `failed` what should not happen. read_only: nothing is ordered but STOP."""
 
     def __init__(
         self,
@@ -67,9 +67,13 @@ class Node:
         devices: Iterable[DeviceState],
         tell: Callable[[Place, bytes], None],
         failed: Callable[[Exception], None],
+        *,
+        read_only: bool = False,
     ) -> None:
         state = bridge.snapshot.state
-        self.modules: dict[str, Module] = modules(devices, state.readings)
+        found = modules(devices, state.readings)
+        self.modules: dict[str, Module] = {n: each.looked_at() for n, each in found.items()} if read_only else found
+        self._read_only = read_only
         self.description = message("describing", ".", _description(state, self.modules))
         self._bridge = bridge
         self._tell, self._failed = tell, failed
@@ -157,6 +161,8 @@ class Node:
         argument = self._argument(command, request)
         if command.order is None:
             return self._done(request, None)
+        if self._read_only:
+            raise Refusal("Disabled", "SECoP may look and do run:stop here, but order nothing: it is read-only")
         came = await self._ordered(command.order(argument), name, None)
         return self._done(request, came.id if isinstance(came, QueuedRun) else None)
 
