@@ -2,6 +2,8 @@ from compensation.arrays import observations_of as observations_of
 from compensation.calibration.board import Board as Board
 from compensation.calibration.calibrate import Calibration as Calibration
 from compensation.calibration.calibrate import calibrate as calibrate
+from compensation.calibration.camera_file import CameraFile as CameraFile
+from compensation.calibration.camera_file import load_camera as load_camera
 from compensation.calibration.session_centres import Positions as Positions
 from compensation.calibration.session_centres import observe_positions as observe_positions
 from compensation.calibration.stage_geometry import TableSigma as TableSigma

@@ -32,6 +32,9 @@ COLD_K = 3.0
 UNPOWERED_TAU_S = 900.0
 """An unpowered camera reports no temperature; its excess over the air is assumed to decay so until it does."""
 SPAN_K, HULL_MARGIN_PX = 20.0, 1.0
+COLDEST_degC, HOTTEST_degC = -273.15, 1000.0
+MOST_CORNERS = 2000
+"""Of a hull: that of a night's markers has about 40. Each point is compared with each corner."""
 LATTICE_PX, ROUNDS = 16, 4
 """Maps are worked out every 16 px; the shift changes by some 1e-4 px per px, and each round of its inverse gains four
 digits."""
@@ -151,9 +154,10 @@ class Drift:
     """One camera and its thermal state."""
 
     def __init__(self, model):
-        """model: what the JSON file holds."""
+        """model: what the JSON file holds; ValueError when numbers of it are none, or do not fit together."""
         if model.get("format") != "thermostand drift runtime" or model.get("version") not in (1, 2):
             raise ValueError("not a drift runtime model of this version")
+        _check(model)
         self._model = model
         self._coefficients = np.array(model["coefficients_px"])
         self._hull_px = np.array(model["hull_px"])
@@ -337,9 +341,32 @@ class Drift:
         return math.inf if leverage is None else _MORE_LEVERAGE * leverage
 
 
+def _check(model):
+    """ValueError that names the entry of the file."""
+    paper = model.get("form") == "paper"
+    count, size = len(model["terms_abc" if paper else "terms"]), model["image_size_px"]
+    shapes = {"coefficients_px": (2 if paper else 8, count), "hull_px": (len(model["hull_px"]), 2)}
+    shapes |= {"image_size_px": (2,), "camera_range_degC": (2,), "discrepancy_px": (2,)}
+    if not paper:
+        shapes |= {"reference_features": (count,), "leverage_matrix": (count, count), "ambient_range_degC": (2,)}
+    for name in (name for name in shapes if name in model):
+        try:
+            found = np.array(model[name], float)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name}: not numbers, as many in each row") from None
+        if found.shape != shapes[name] or not np.isfinite(found).all():
+            raise ValueError(f"{name}: not finite numbers of shape {shapes[name]}")
+    if not 3 <= len(model["hull_px"]) <= MOST_CORNERS:
+        raise ValueError(f"hull_px: {len(model['hull_px'])} corners, not 3 to {MOST_CORNERS}")
+    # No term is much above 1 in the calibrated range.
+    moved = np.abs(np.array(model["coefficients_px"], float)).sum(axis=1).max(initial=0.0)
+    if not (min(size) > 0 and moved <= max(size)):
+        raise ValueError(f"coefficients_px: they move points by {moved:.3g} px, in an image of {max(size)}")
+
+
 def is_temperature(degC):
     """Whether it can be one; NaN cannot."""
-    return -273.15 <= degC <= 1000.0
+    return COLDEST_degC <= degC <= HOTTEST_degC
 
 
 def source_offset(shift, xy_px):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Hashable
 from contextlib import suppress
@@ -21,6 +22,8 @@ else:
     from yaml import CSafeLoader as QuickLoader
 
 _LONGEST_TEXT, _MOST_VALUES = 250_000, 100_000  # of a document: a hundred times of what ours have
+_LONGEST_JSON = 20_000_000  # bytes: a night's model has 0.6 MB, one of the oldest format 5
+_MAKE_AGAIN = "; it was changed or damaged since: take it from where it was made, or make it again"
 _MOST_OPENED = 2000  # characters that may begin a level
 
 
@@ -98,21 +101,44 @@ def parse_document(text: str, model: type[Model], where: str) -> Model:
 
 def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
     """What `read` makes of the text of a JSON file that this program has written; SessionError, which says that it is
-    not `what`, when that refuses it or the file cannot be read."""
+    not `what`, when that refuses it, the file cannot be read or is far longer than any of ours, a key is given twice,
+    or values are nested deeper than Python goes."""
     try:
-        return read(Path(path).read_text(encoding="utf-8"))
+        with Path(path).open("rb") as file:  # at most so much, also of a device without an end
+            data = file.read(_LONGEST_JSON + 1)
+        text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         kind = NotThere if isinstance(error, FileNotFoundError) else SessionError
         raise kind(unreadable(path, error)) from error
+    not_ours = f"{path}: not {what} of this program"
+    if len(data) > _LONGEST_JSON:
+        raise SessionError(f"{not_ours} (it has more than {_LONGEST_JSON // 10**6} MB, and such a file has less)")
+    try:
+        json.loads(text, object_pairs_hook=_with_each_key_once)
+        return read(text)
+    except RecursionError:
+        raise SessionError(f"{not_ours} (nested too deeply)") from None
     except ValidationError as error:
         fault = error.errors()[0]
         # What a file of another kind lacks is no news to a reader; what is wrong inside of one of this kind is.
         where, kind_of_fault = path_text(fault["loc"]), fault["type"]
         place = f"{where}: " if where else ""  # what concerns the whole file has none
-        more = "" if kind_of_fault.startswith("union_tag") else f" ({place}{fault['msg']})"
-        raise SessionError(f"{path}: not {what} of this program{more}") from error
+        more = (
+            "" if kind_of_fault.startswith("union_tag") else f" ({place}{fault['msg'].removeprefix('Value error, ')})"
+        )
+        raise SessionError(f"{not_ours}{more}{_MAKE_AGAIN}") from error
     except ValueError as error:
-        raise SessionError(f"{path}: not {what} of this program ({error})") from error
+        raise SessionError(f"{not_ours} ({error}){_MAKE_AGAIN}") from error
+
+
+def _with_each_key_once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """JSON parsers keep the last of two equal keys without a word."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        seen = set[str]()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        raise ValueError(f"key {twice!r} is given twice")
+    return found
 
 
 def yaml_data(text: str, where: str) -> object:

@@ -1,5 +1,6 @@
 from compensation import Board as Board
 from compensation import Calibration as Calibration
+from compensation import CameraFile as CameraFile
 from compensation import DriftModel as DriftModel
 from compensation import Evaluation as Evaluation
 from compensation import Observations as Observations
@@ -16,6 +17,7 @@ from compensation import calibrate_views as calibrate_views
 from compensation import evaluate as evaluate
 from compensation import finder as finder
 from compensation import fit as fit
+from compensation import load_camera as load_camera
 from compensation import load_model as load_model
 from compensation import observations_of as observations_of
 from compensation import observe as observe

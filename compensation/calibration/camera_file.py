@@ -1,6 +1,6 @@
 """The camera file: a calibration with its covariances, board, table and scores, as JSON (which is YAML, too).
 
-camera = CameraFile.load(path)
+camera = load_camera(path)
 pose = find_pose(camera.lens, camera.board_points, detection.centres_px, detection.covariance_px2)
 """
 
@@ -17,16 +17,30 @@ from compensation.calibration.board import Board
 from compensation.calibration.calibrate import Calibration
 from compensation.calibration.pinhole import NAMES, Pinhole
 from compensation.calibration.rays import RayLens, exponents
-from compensation.calibration.stage_geometry import PARAMETERS
+from compensation.calibration.stage_geometry import ERRORS, PARAMETERS
+from compensation.drift.hull import is_area
+from compensation.sound_values import (
+    Hull,
+    Length,
+    NotNegative,
+    Pair,
+    Size,
+    check_covariance,
+    check_within_image,
+    shaped,
+)
 from foundation.documents import Document, load_json
 from foundation.files import write_whole
 from foundation.json_values import plain
 
 FORMAT = "thermostand camera"
 
-Size = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
-Pair = tuple[float, float]
+_LONGEST_FOCAL = 1000  # times the image's larger side; a telescope's lens has 300
+_FARTHEST_CENTRE = 10  # of the image from the principal point, in larger sides: far more than a shifted lens has
+_TURNED = 1e-6  # from a rotation, or a unit vector, by rounding
+
 Triple = tuple[float, float, float]
+Place = tuple[Length, Length, Length]
 Row = tuple[float, ...]
 Matrix3 = tuple[Triple, Triple, Triple]
 
@@ -35,37 +49,51 @@ class Fit(Document):
     """How the adjustment went. rms_px, detection_sigma_px: per coordinate; ratio: of the two, marker by marker.
     discrepancy_px: what noise and priors do not explain. chi: of all residuals per degree of freedom."""
 
-    rms_px: float
-    detection_sigma_px: float
-    ratio: float
-    discrepancy_px: float
-    chi: float
+    rms_px: NotNegative
+    detection_sigma_px: NotNegative
+    ratio: NotNegative
+    discrepancy_px: NotNegative
+    chi: NotNegative
     markers: int
     outliers: int
-    frame_scatter_chi: float | None
+    frame_scatter_chi: NotNegative | None
 
 
 class TablePart(Document):
     """The axes and the target's mount in the camera's frame, and per position what was recorded and what was wrong
     with it: errors d (mm) and w (rad) of compensation/calibration/stage_geometry.py, RMS residual per coordinate."""
 
-    base_mm: Triple
+    base_mm: Place
     linear: Triple
     rotary: Triple
     mount: Matrix3
-    offset_mm: Triple
+    offset_mm: Place
     linear_mm: Row
     rotary_deg: Row
     errors_mm_rad: tuple[Row, ...]
-    rms_px: tuple[float | None, ...]
+    rms_px: tuple[NotNegative | None, ...]
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> TablePart:
+        positions = len(self.linear_mm)
+        shaped("rotary_deg", self.rotary_deg, (positions,))
+        shaped("errors_mm_rad", self.errors_mm_rad, (positions, ERRORS))
+        if len(self.rms_px) != positions:
+            raise ValueError(f"rms_px: {len(self.rms_px)} for {positions} positions")
+        mount = np.array(self.mount)
+        if np.abs(mount @ mount.T - np.eye(3)).max() > _TURNED or np.linalg.det(mount) < 0:
+            raise ValueError("mount: not a rotation")
+        if np.abs(np.linalg.norm([self.linear, self.rotary], axis=1) - 1).max() > _TURNED:
+            raise ValueError("linear, rotary: not of length 1")
+        return self
 
 
 class BoardPart(Document):
     """Adjusted marker centres, their standard uncertainties, and the diameters."""
 
-    points_mm: tuple[Triple, ...]
-    sigma_mm: tuple[Triple, ...]
-    diameters_mm: Row
+    points_mm: tuple[Place, ...]
+    sigma_mm: tuple[tuple[NotNegative, NotNegative, NotNegative], ...]
+    diameters_mm: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
 
 
 class RaysPart(Document):
@@ -76,15 +104,15 @@ class RaysPart(Document):
     coefficients_mm: tuple[tuple[Row, Row], tuple[Row, Row]]
     covariance_mm2: tuple[Row, ...]
     range_mm: Pair
-    hull_px: Annotated[tuple[Pair, ...], Field(min_length=3)]
+    hull_px: Hull
 
 
 class ScorePart(Document):
     """Hold-out score of a model (compensation/calibration/model_scores.py)."""
 
     model: str
-    rms_px: float
-    sigma_px: float
+    rms_px: NotNegative
+    sigma_px: NotNegative
     positions: int
 
 
@@ -95,8 +123,13 @@ class UncertaintyPart(Document):
     distance_mm: float
     x_px: Row
     y_px: Row
-    sigma_px: tuple[tuple[float | None, ...], ...]
-    halves_rms_px: float | None
+    sigma_px: tuple[tuple[NotNegative | None, ...], ...]
+    halves_rms_px: NotNegative | None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> UncertaintyPart:
+        shaped("sigma_px", self.sigma_px, (len(self.y_px), len(self.x_px)))
+        return self
 
 
 class CameraFile(Document):
@@ -126,15 +159,40 @@ class CameraFile(Document):
     def _fits_together(self) -> CameraFile:
         if len(self.vector) not in (9, 12) or self.names != NAMES[: len(self.vector)]:
             raise ValueError("names: not those of a pinhole with 5 or 8 distortion terms")
-        _square("covariance", self.covariance, len(self.vector) + PARAMETERS)
+        known = len(self.vector) + PARAMETERS
+        shaped("covariance", self.covariance, (known, known))
         terms = exponents(self.rays.degree)
         if list(self.rays.terms_pq) != terms:
             raise ValueError(f"rays.terms_pq: not the {len(terms)} terms of degree {self.rays.degree}, in order")
         if any(len(row) != len(terms) for part in self.rays.coefficients_mm for row in part):
             raise ValueError(f"rays.coefficients_mm: not {len(terms)} coefficients each")
-        _square("rays.covariance_mm2", self.rays.covariance_mm2, 2 * len(terms))
+        shaped("rays.covariance_mm2", self.rays.covariance_mm2, (2 * len(terms), 2 * len(terms)))
         if not len(self.board.points_mm) == len(self.board.sigma_mm) == len(self.board.diameters_mm):
             raise ValueError("board: points_mm, sigma_mm and diameters_mm have different lengths")
+        return self
+
+    def check_sound(self) -> CameraFile:
+        """Itself; ValueError unless covariances are some, and both lenses see the markers that they were made of, less
+        than an image away from each other."""
+        check_covariance("covariance", np.array(self.covariance))
+        check_covariance("rays.covariance_mm2", np.array(self.rays.covariance_mm2))
+        side, lens, rays = max(self.image_size_px), self.lens, self.rays
+        fx, fy, cx, cy = self.vector[:4]
+        if not (0 < fx <= _LONGEST_FOCAL * side and 0 < fy <= _LONGEST_FOCAL * side):
+            raise ValueError(f"vector: the focal lengths are {fx:.3g} and {fy:.3g} px for an image of {side} px")
+        if max(abs(cx), abs(cy)) > _FARTHEST_CENTRE * side:
+            raise ValueError(f"vector: the centre is at {cx:.3g}, {cy:.3g} px of an image of {side} px")
+        if not 0 < rays.range_mm[0] < rays.range_mm[1]:
+            raise ValueError("rays.range_mm: not near, far")
+        hull_px = np.array(rays.hull_px)
+        if not is_area(hull_px):
+            raise ValueError("rays.hull_px: not the corners of a convex area, in order")
+        with np.errstate(all="ignore"):  # of numbers that are refused below
+            slopes = lens.slopes(hull_px)
+            apart_px = np.abs(self.ray_lens.slopes(hull_px) - slopes) * lens.focal_px
+        if not np.isfinite(slopes).all():
+            raise ValueError("vector: this distortion folds the image where the markers were seen")
+        check_within_image("rays.coefficients_mm", apart_px, self.image_size_px)
         return self
 
     @property
@@ -159,10 +217,12 @@ class CameraFile(Document):
         """Write the file, whole or not at all; SessionError when the place refuses."""
         write_whole(path, self.model_dump_json(indent=1) + "\n")
 
-    @classmethod
-    def load(cls, path: Path) -> CameraFile:
-        """The camera in a file that `save` wrote, number for number; SessionError when it is anything else."""
-        return load_json(path, lambda text: cls.model_validate_json(text, strict=True), "a camera file")
+
+def load_camera(path: Path | str) -> CameraFile:
+    """The camera in a file that `save` wrote, number for number; SessionError when it is anything else."""
+    return load_json(
+        path, lambda text: CameraFile.model_validate_json(text, strict=True).check_sound(), "a camera file"
+    )
 
 
 def camera_file(
@@ -241,8 +301,3 @@ def _uncertainty(calibration: Calibration) -> dict[str, object]:
         "sigma_px": found.sigma_px,
         "halves_rms_px": None if calibration.halves is None else calibration.halves.rms_px,
     }
-
-
-def _square(name: str, rows: tuple[Row, ...], size: int) -> None:
-    if len(rows) != size or any(len(row) != size for row in rows):
-        raise ValueError(f"{name}: not {size} x {size}")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from compensation.budget.geometry import load_geometry
-from compensation.calibration.camera_file import CameraFile
+from compensation.calibration.camera_file import load_camera
 from compensation.commands.options import Finding
 from compensation.drift.model_file import load_model
 from compensation.observations import Float
@@ -52,7 +52,7 @@ def validate_session(
     -o validation.html
     """
     beside = _numbers_beside(out)
-    file, drift = CameraFile.load(camera), load_model(model)
+    file, drift = load_camera(camera), load_model(model)
     geometry = None if budget is None else load_geometry(budget)
     opened = Session.open(session)
     observations = finding.observed([session], name_of(opened, file.camera_serial))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from compensation.drift.displacements import Displacements
 from compensation.history.states import Float
@@ -37,6 +38,11 @@ class Candidate(Document):
     fold_chamber_degC: tuple[float, ...]
     fold_rms_px: tuple[Pair, ...]
 
+    @model_validator(mode="after")
+    def _fits_together(self) -> Candidate:
+        check_folds(self.fold_chamber_degC, self.fold_rms_px)
+        return self
+
     @property
     def fold_squares(self) -> Float:
         """(folds,): mean square of both coordinates, px^2."""
@@ -46,6 +52,12 @@ class Candidate(Document):
     def squares_between(self) -> Float:
         """(folds,): of the set-points between others, by which forms and families are chosen."""
         return self.fold_squares[between(np.array(self.fold_chamber_degC))]
+
+
+def check_folds(fold_chamber_degC: tuple[float, ...], fold_rms_px: tuple[Pair, ...]) -> None:
+    """ValueError when there are not as many of one as of the other."""
+    if len(fold_chamber_degC) != len(fold_rms_px):
+        raise ValueError(f"fold_rms_px: {len(fold_rms_px)} for {len(fold_chamber_degC)} set-points")
 
 
 def pair_of(values: Float) -> Pair:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, model_validator
 
 from compensation.drift.between_nights import BetweenNights
 from compensation.drift.bump import Bump
@@ -27,7 +27,18 @@ from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import exponents
 from compensation.drift.terms import MOTIONS, Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from compensation.drift_runtime import HOTTEST_degC
 from compensation.history.states import Float
+from compensation.sound_values import (
+    Degrees,
+    Hull,
+    NotNegative,
+    Size,
+    check_covariance,
+    check_order,
+    check_within_image,
+    shaped,
+)
 from foundation.documents import Document, load_json
 from foundation.files import write_whole
 
@@ -39,7 +50,10 @@ _FACTS = (
     *("reference_chamber_degC", "bumps"),
 )
 """Fields of ModelFacts that a file has as they are."""
-Positive = Annotated[int, Field(gt=0)]
+_REMEMBERS_NOTHING = (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE, Kind.PLAY)
+_LONGEST_S = 1e9
+Spread = tuple[NotNegative, NotNegative]
+Range = tuple[Degrees, Degrees]
 Rows = tuple[tuple[float, ...], ...]
 
 
@@ -52,13 +66,13 @@ class _File(Document):
     camera_serial: str
     session_ids: tuple[str, ...]
     target_name: str
-    image_size_px: tuple[Positive, Positive]
-    camera_range_degC: Pair
-    reference_degC: float
-    reference_chamber_degC: float
+    image_size_px: Size
+    camera_range_degC: Range
+    reference_degC: Degrees
+    reference_chamber_degC: Degrees
     reference_centres_px: tuple[Pair | None, ...]
-    hull_px: Annotated[tuple[Pair, ...], Field(min_length=3)]
-    discrepancy_px: Pair
+    hull_px: Hull
+    discrepancy_px: Spread
     candidates: tuple[Candidate, ...]
     bumps: tuple[Bump, ...] = ()
 
@@ -79,9 +93,16 @@ class TermFile(Document):
     """A term; the parameter is a time constant, s, or the radius of a play, K. tau_s, share: of a part's play."""
 
     kind: Kind
-    parameter: Annotated[float, Field(ge=0)]
-    tau_s: Annotated[float, Field(ge=0)] = 0.0
+    parameter: Annotated[float, Field(ge=0, le=_LONGEST_S)]
+    tau_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 0.0
     share: Annotated[float, Field(ge=0, le=1)] = 0.0
+
+    @model_validator(mode="after")
+    def _has_time(self) -> TermFile:
+        tau_s = self.tau_s if self.kind is Kind.PART_PLAY else self.parameter
+        if tau_s == 0 and self.kind not in _REMEMBERS_NOTHING:
+            raise ValueError(f"a {self.kind} has a time constant above 0")
+        return self
 
 
 class ThermalFile(_File):
@@ -91,20 +112,20 @@ class ThermalFile(_File):
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[TermFile, ...]
-    reference_ambient_degC: float
+    reference_ambient_degC: Degrees
     reference_features: tuple[float, ...]
-    self_heating_K: Annotated[float, Field(gt=0)]
+    self_heating_K: Annotated[float, Field(gt=0, le=HOTTEST_degC)]
     has_warm_up: bool
     coefficients_px: Rows
     coefficient_covariance_px2: Rows
-    ambient_range_degC: Pair
+    ambient_range_degC: Range
     rate_range_K_per_h: Pair
-    least_on_s: float | None
+    least_on_s: NotNegative | None
     leverage_matrix_px2: Rows | None = None
-    leverage_px2: float | None = None
+    leverage_px2: Annotated[float, Field(gt=0)] | None = None
     usual_leverage_px2: float | None = None
-    history_s: float | None = None
-    between_nights_px: Pair | None = None
+    history_s: NotNegative | None = None
+    between_nights_px: Spread | None = None
     nights_compared: Annotated[int, Field(ge=0)] = 0
     other: PaperFile | None = None
 
@@ -199,13 +220,16 @@ def _paper(file: PaperFile) -> PaperModel:
         raise ValueError(f"terms_abc: not the {count} terms of degree {file.degree}, in order")
     if file.degree not in {score.degree for score in file.scores}:
         raise ValueError(f"scores: none for degree {file.degree}")
+    coefficients = shaped("coefficients_px", file.coefficients_px, (2, count))
+    covariance = shaped("coefficient_covariance_px2", file.coefficient_covariance_px2, (2, count, count))
+    # No term is greater than 1 within image and calibrated range.
+    check_within_image("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
+    check_covariance("coefficient_covariance_px2", covariance)
     return PaperModel(
         facts=_facts(file),
         degree=file.degree,
-        coefficients=_shaped("coefficients_px", file.coefficients_px, (2, count)),
-        coefficient_covariance=_shaped(
-            "coefficient_covariance_px2", file.coefficient_covariance_px2, (2, count, count)
-        ),
+        coefficients=coefficients,
+        coefficient_covariance=covariance,
         discrepancy_px=np.array(file.discrepancy_px),
         scores=file.scores,
         candidates=file.candidates,
@@ -216,17 +240,27 @@ def _thermal(file: ThermalFile) -> ThermalModel:
     """The model of a file; ValueError when its parts do not fit together."""
     count = len(file.terms)
     covariance, leverage = _blocks(file, count), file.leverage_matrix_px2
+    reference_features = shaped("reference_features", file.reference_features, (count,))
+    coefficients = shaped("coefficients_px", file.coefficients_px, (MOTIONS, count))
+    leverage_matrix = (
+        covariance[0] + covariance[1] if leverage is None else shaped("leverage_matrix_px2", leverage, (count, count))
+    )
+    # Features are about 1 at 20 K from the reference, motions at the image's edge.
+    check_within_image("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
+    check_within_image("reference_features", coefficients @ reference_features, file.image_size_px)
+    check_covariance("coefficient_covariance_px2", covariance)
+    check_covariance("leverage_matrix_px2", leverage_matrix)
+    check_order("ambient_range_degC", file.ambient_range_degC)
+    check_order("rate_range_K_per_h", file.rate_range_K_per_h)
     return ThermalModel(
         facts=_facts(file),
         terms=tuple(Term(term.kind, term.parameter, term.tau_s, term.share) for term in file.terms),
         reference_ambient_degC=file.reference_ambient_degC,
         self_heating_K=file.self_heating_K,
-        reference_features=_shaped("reference_features", file.reference_features, (count,)),
-        coefficients=_shaped("coefficients_px", file.coefficients_px, (MOTIONS, count)),
+        reference_features=reference_features,
+        coefficients=coefficients,
         coefficient_covariance=covariance,
-        leverage_matrix=covariance[0] + covariance[1]
-        if leverage is None
-        else _shaped("leverage_matrix_px2", leverage, (count, count)),
+        leverage_matrix=leverage_matrix,
         discrepancy_px=np.array(file.discrepancy_px),
         valid=ThermalRange(
             ambient_degC=file.ambient_range_degC,
@@ -247,7 +281,7 @@ def _blocks(file: ThermalFile, count: int) -> Float:
     """(8, H, H)."""
     given = file.coefficient_covariance_px2
     whole = bool(given) and len(given[0]) == MOTIONS * count
-    rows = _shaped("coefficient_covariance_px2", given, (MOTIONS * count, MOTIONS * count if whole else count))
+    rows = shaped("coefficient_covariance_px2", given, (MOTIONS * count, MOTIONS * count if whole else count))
     return np.stack([rows[k : k + count, k if whole else 0 :][:, :count] for k in range(0, len(rows), count)])
 
 
@@ -263,13 +297,3 @@ def _facts(file: PaperFile | ThermalFile) -> ModelFacts:
         hull_px=hull_px,
         reference_centres_px=np.array([centre or (math.nan, math.nan) for centre in file.reference_centres_px]),
     )
-
-
-def _shaped(name: str, values: object, shape: tuple[int, ...]) -> Float:
-    try:
-        array = np.array(values, np.float64)
-    except ValueError as error:
-        raise ValueError(f"{name}: rows of different lengths") from error
-    if array.shape != shape:
-        raise ValueError(f"{name}: shape {array.shape} instead of {shape}")
-    return array

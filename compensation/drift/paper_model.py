@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from compensation.drift.candidates import Pair
+from compensation.drift.candidates import Pair, check_folds
 from compensation.drift.drift_model import DriftModel, Flags, Outside, Situation, place_flags, range_flags, states_of
 from compensation.drift.polynomial import Float, Scaling, design
 from compensation.history.states import Memory
@@ -35,6 +35,11 @@ class DegreeScore(Document):
     rms_px: Pair
     fold_chamber_degC: tuple[float, ...]
     fold_rms_px: tuple[Pair, ...]
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> DegreeScore:
+        check_folds(self.fold_chamber_degC, self.fold_rms_px)
+        return self
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -1,0 +1,77 @@
+"""What numbers in a file from elsewhere must be, before anything is computed with them.
+
+Each `check_` raises a ValueError that begins with the place in the file.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from compensation.drift_runtime import MOST_CORNERS, COLDEST_degC, HOTTEST_degC
+from compensation.observations import Float
+
+_LARGEST_SIDE_px = 100_000  # four times the largest sensors that are sold
+_FARTHEST_mm = 1e6
+
+Pair = tuple[float, float]
+Side = Annotated[int, Field(gt=0, le=_LARGEST_SIDE_px)]
+Size = tuple[Side, Side]
+Length = Annotated[float, Field(ge=-_FARTHEST_mm, le=_FARTHEST_mm)]
+Degrees = Annotated[float, Field(ge=COLDEST_degC, le=HOTTEST_degC)]
+NotNegative = Annotated[float, Field(ge=0)]
+Hull = Annotated[tuple[Pair, ...], Field(min_length=3, max_length=MOST_CORNERS)]
+
+_ASYMMETRY, _NEGATIVE = 1e-6, 1e-6
+"""Of correlations, by rounding. Measured on 3 drawn nights, a type prior and the calibrations of the tests: covariances
+are symmetric to 1e-11, and their smallest eigenvalue is above -1e-9."""
+
+
+def shaped(name: str, values: object, shape: tuple[int, ...]) -> Float:
+    """As an array of this shape."""
+    try:
+        array = np.array(values, np.float64)
+    except ValueError as error:
+        raise ValueError(f"{name}: rows of different lengths") from error
+    if array.shape != shape:
+        raise ValueError(f"{name}: shape {array.shape} instead of {shape}")
+    return array
+
+
+def check_covariance(name: str, covariance: Float) -> None:
+    """Of (n, n) or several of them (..., n, n): no variance below 0, symmetric and positive semidefinite within
+    rounding. Judged by the correlations: parameters of different units have variances of different sizes."""
+    size = covariance.shape[-1]
+    for matrix in covariance.reshape(-1, size, size):
+        variance = np.diagonal(matrix)
+        if (variance < 0).any():
+            at = int(np.argmin(variance))
+            raise ValueError(f"{name}: the variance in row {at} is {variance[at]:.3g}, and none is below 0")
+        sigma = np.sqrt(variance)
+        scale = np.where(sigma > 0, sigma, np.inf)
+        correlation = matrix / scale[:, None] / scale
+        if np.abs(correlation - correlation.T).max(initial=0.0) > _ASYMMETRY:
+            raise ValueError(f"{name}: not symmetric, as a covariance is")
+        if (matrix[sigma == 0] != 0).any() or np.linalg.eigvalsh((correlation + correlation.T) / 2)[
+            0
+        ] < -_NEGATIVE * size:
+            raise ValueError(f"{name}: not positive semidefinite, as a covariance is")
+
+
+def check_within_image(name: str, moves_px: ArrayLike, image_size: tuple[int, int]) -> None:
+    """moves_px: how far something moves a point, px."""
+    greatest, limit = float(np.max(np.abs(moves_px))), max(image_size)
+    if not greatest <= limit:
+        raise ValueError(
+            f"{name}: they move points by {greatest:.3g} px; the image has {limit}, and what moves a point further "
+            "than that corrects nothing"
+        )
+
+
+def check_order(name: str, low_high: Pair) -> None:
+    """Of the ends of a range."""
+    if not low_high[0] <= low_high[1]:
+        raise ValueError(f"{name}: not low, high")
