@@ -16,6 +16,7 @@ from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.session_centres import Positions
 from compensation.calibration.stage_geometry import ERRORS, TableSigma
+from compensation.drift.hull import convex_hull
 
 _ROUNDS = 10
 _OUTLIER = 8.0
@@ -67,6 +68,11 @@ class Adjustment:
     def rms_px(self) -> float:
         """Root mean square residual per coordinate."""
         return float(np.sqrt(np.mean(self.residuals_px[self.used] ** 2)))
+
+    @property
+    def hull_px(self) -> Float:
+        """(H, 2): of the markers that were used, where they were seen."""
+        return convex_hull(self.positions.centres_px[self.used])
 
     @property
     def normalised(self) -> Float:

@@ -15,8 +15,10 @@ from pydantic import Field, model_validator
 from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.board import Board
 from compensation.calibration.calibrate import Calibration
+from compensation.calibration.least_squares import Float
 from compensation.calibration.pinhole import NAMES, Pinhole
 from compensation.calibration.rays import RayLens, exponents
+from compensation.calibration.seen_area import NOT_SEEN
 from compensation.calibration.stage_geometry import ERRORS, PARAMETERS
 from compensation.drift.hull import is_area
 from compensation.sound_values import (
@@ -30,6 +32,7 @@ from compensation.sound_values import (
     shaped,
 )
 from foundation.documents import Document, load_json
+from foundation.errors import CalibrationError
 from foundation.files import write_whole
 from foundation.json_values import plain
 
@@ -106,6 +109,15 @@ class RaysPart(Document):
     range_mm: Pair
     hull_px: Hull
 
+    @model_validator(mode="after")
+    def _fits_together(self) -> RaysPart:
+        count = len(exponents(self.degree))
+        if list(self.terms_pq) != exponents(self.degree):
+            raise ValueError(f"terms_pq: not the {count} terms of degree {self.degree}, in order")
+        shaped("coefficients_mm", self.coefficients_mm, (2, 2, count))
+        shaped("covariance_mm2", self.covariance_mm2, (2 * count, 2 * count))
+        return self
+
 
 class ScorePart(Document):
     """Hold-out score of a model (compensation/calibration/model_scores.py)."""
@@ -117,14 +129,16 @@ class ScorePart(Document):
 
 
 class UncertaintyPart(Document):
-    """Standard uncertainty of the projection, root mean square of both coordinates, at evenly spread pixels.
-    halves_rms_px: how far the halves' calibrations differ, null when that is not known."""
+    """Standard uncertainty of the projection, root mean square of both coordinates, at evenly spread pixels; null where
+    no marker was near, which not_seen says. halves_rms_px: how far the halves' calibrations differ where both have
+    seen, null when that is not known."""
 
     distance_mm: float
     x_px: Row
     y_px: Row
     sigma_px: tuple[tuple[NotNegative | None, ...], ...]
     halves_rms_px: NotNegative | None
+    not_seen: str = ""
 
     @model_validator(mode="after")
     def _fits_together(self) -> UncertaintyPart:
@@ -134,7 +148,8 @@ class UncertaintyPart(Document):
 
 class CameraFile(Document):
     """A calibrated camera. names, vector: fx fy cx cy (px) and the distortion; covariance: of the vector, then a step
-    of the table (c mm, l, a, R0 rad, o mm). scores: none when they are not known; not_known: which checks, and why."""
+    of the table (c mm, l, a, R0 rad, o mm). scores: none when they are not known; not_known: which checks, and why.
+    rays_doubt: why there are no rays, or why not to use them; "" when they describe the lens."""
 
     format: Literal["thermostand camera"] = FORMAT
     schema_version: Literal[1] = 1
@@ -150,10 +165,11 @@ class CameraFile(Document):
     fit: Fit
     table: TablePart
     board: BoardPart
-    rays: RaysPart
+    rays: RaysPart | None
     scores: tuple[ScorePart, ...]
     uncertainty: UncertaintyPart
     not_known: tuple[str, ...] = ()
+    rays_doubt: str = ""
 
     @model_validator(mode="after")
     def _fits_together(self) -> CameraFile:
@@ -161,12 +177,6 @@ class CameraFile(Document):
             raise ValueError("names: not those of a pinhole with 5 or 8 distortion terms")
         known = len(self.vector) + PARAMETERS
         shaped("covariance", self.covariance, (known, known))
-        terms = exponents(self.rays.degree)
-        if list(self.rays.terms_pq) != terms:
-            raise ValueError(f"rays.terms_pq: not the {len(terms)} terms of degree {self.rays.degree}, in order")
-        if any(len(row) != len(terms) for part in self.rays.coefficients_mm for row in part):
-            raise ValueError(f"rays.coefficients_mm: not {len(terms)} coefficients each")
-        shaped("rays.covariance_mm2", self.rays.covariance_mm2, (2 * len(terms), 2 * len(terms)))
         if not len(self.board.points_mm) == len(self.board.sigma_mm) == len(self.board.diameters_mm):
             raise ValueError("board: points_mm, sigma_mm and diameters_mm have different lengths")
         return self
@@ -175,25 +185,36 @@ class CameraFile(Document):
         """Itself; ValueError unless covariances are some, and both lenses see the markers that they were made of, less
         than an image away from each other."""
         check_covariance("covariance", np.array(self.covariance))
-        check_covariance("rays.covariance_mm2", np.array(self.rays.covariance_mm2))
-        side, lens, rays = max(self.image_size_px), self.lens, self.rays
+        side = max(self.image_size_px)
         fx, fy, cx, cy = self.vector[:4]
         if not (0 < fx <= _LONGEST_FOCAL * side and 0 < fy <= _LONGEST_FOCAL * side):
             raise ValueError(f"vector: the focal lengths are {fx:.3g} and {fy:.3g} px for an image of {side} px")
         if max(abs(cx), abs(cy)) > _FARTHEST_CENTRE * side:
             raise ValueError(f"vector: the centre is at {cx:.3g}, {cy:.3g} px of an image of {side} px")
+        middle = (np.array(self.image_size_px) - 1.0) / 2
+        self._slopes(middle if self.rays is None else np.array(self.rays.hull_px))
+        if self.rays is not None:
+            self._check_rays(self.rays)
+        return self
+
+    def _slopes(self, pixels: Float) -> Float:
+        """(..., 2), of the pinhole."""
+        with np.errstate(all="ignore"):  # of numbers that are refused here
+            slopes = self.lens.slopes(pixels)
+        if not np.isfinite(slopes).all():
+            raise ValueError("vector: this distortion folds the image where the markers were seen")
+        return slopes
+
+    def _check_rays(self, rays: RaysPart) -> None:
+        check_covariance("rays.covariance_mm2", np.array(rays.covariance_mm2))
         if not 0 < rays.range_mm[0] < rays.range_mm[1]:
             raise ValueError("rays.range_mm: not near, far")
         hull_px = np.array(rays.hull_px)
         if not is_area(hull_px):
             raise ValueError("rays.hull_px: not the corners of a convex area, in order")
-        with np.errstate(all="ignore"):  # of numbers that are refused below
-            slopes = lens.slopes(hull_px)
-            apart_px = np.abs(self.ray_lens.slopes(hull_px) - slopes) * lens.focal_px
-        if not np.isfinite(slopes).all():
-            raise ValueError("vector: this distortion folds the image where the markers were seen")
+        with np.errstate(all="ignore"):
+            apart_px = np.abs(self.ray_lens.slopes(hull_px) - self._slopes(hull_px)) * self.lens.focal_px
         check_within_image("rays.coefficients_mm", apart_px, self.image_size_px)
-        return self
 
     @property
     def lens(self) -> Pinhole:
@@ -202,8 +223,9 @@ class CameraFile(Document):
 
     @property
     def ray_lens(self) -> RayLens:
-        """The ray model."""
-        part = self.rays
+        """The ray model; CalibrationError when the file has none."""
+        if (part := self.rays) is None:
+            raise CalibrationError(f"the camera file has no ray model: {self.rays_doubt or 'it was left out'}")
         coefficients, covariance = np.array(part.coefficients_mm), np.array(part.covariance_mm2)
         return RayLens(part.degree, coefficients, covariance, part.range_mm, np.array(part.hull_px), self.lens)
 
@@ -232,8 +254,10 @@ def camera_file(
     session_ids: tuple[str, ...],
     target_name: str,
     software_version: str,
+    keep_rays: bool = False,
 ) -> CameraFile:
-    """Everything a calibration found, as the file holds it."""
+    """Everything a calibration found, as the file holds it; of a ray model that does not describe the lens why not,
+    unless keep_rays."""
     lens = calibration.adjustment.scene.lens
     known = len(lens.vector) + PARAMETERS
     document = {
@@ -249,7 +273,8 @@ def camera_file(
         "fit": _fit(calibration),
         "table": _table(calibration.adjustment),
         "board": calibration.adjustment.adjusted_board,
-        "rays": _rays(calibration.rays),
+        "rays": None if calibration.rays_doubt and not keep_rays else _rays(calibration.rays),
+        "rays_doubt": calibration.rays_doubt,
         "scores": calibration.scores,
         "uncertainty": _uncertainty(calibration),
         "not_known": calibration.not_known,
@@ -300,4 +325,5 @@ def _uncertainty(calibration: Calibration) -> dict[str, object]:
         "y_px": found.pixels[:, 0, 1],
         "sigma_px": found.sigma_px,
         "halves_rms_px": None if calibration.halves is None else calibration.halves.rms_px,
+        "not_seen": NOT_SEEN if np.isnan(found.sigma_px).any() else "",
     }

@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from compensation.calibration.adjustment import Adjustment, adjust, start_of
 from compensation.calibration.board import Board
@@ -48,13 +47,26 @@ def known_or_why(check: Callable[[], Check]) -> tuple[Check | None, str]:
 
 def rays_of(adjustment: Adjustment, degree: int) -> RayLens:
     """The ray model of a degree through the adjusted markers."""
+    return fit_rays(degree, *_used(adjustment), adjustment.scene.lens, adjustment.hull_px)
+
+
+def times_the_pinhole(adjustment: Adjustment, rays: RayLens, scores: tuple[ModelScore, ...]) -> float:
+    """What the rays leave over what the pinhole leaves: RMS at held-out positions, and without these residuals in
+    units of the noise and of what the pinhole does not explain."""
+    of = {score.model: score.rms_px for score in scores}
+    if scores:
+        return of[ray_name(rays.degree)] / min(of[BROWN], of[RATIONAL])
+    pixels, points_mm, sigma_px = _used(adjustment)
+    return float(np.sqrt(np.mean((rays.misfit(points_mm, pixels) / sigma_px[:, None]) ** 2)))
+
+
+def _used(adjustment: Adjustment) -> tuple[Float, Float, Float]:
+    """Pixels (M, 2), points (M, 3), mm, of the camera's frame, and sigma (M,), px, of the markers that were used."""
     used, positions = adjustment.used, adjustment.positions
     rotations, translations = adjustment.poses()
     points = np.einsum("pij,nj->pni", rotations, adjustment.scene.points_mm) + translations[:, None]
-    pixels = positions.centres_px[used]
     variance = np.trace(positions.covariance_px2[used], axis1=1, axis2=2) / 2 + adjustment.discrepancy_px**2
-    hull = pixels[ConvexHull(pixels).vertices]
-    return fit_rays(degree, pixels, points[used], np.sqrt(variance), adjustment.scene.lens, hull)
+    return positions.centres_px[used], points[used], np.sqrt(variance)
 
 
 def score_models(positions: Positions, board: Board, sigma: TableSigma) -> tuple[ModelScore, ...]:

@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.least_squares import Float
+from compensation.calibration.seen_area import seen
 from compensation.calibration.stage_geometry import ERRORS, PARAMETERS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertaintyMap:
-    """pixels (H, W, 2), covariance_px2 (H, W, 2, 2) of the projection at distance_mm."""
+    """pixels (H, W, 2), covariance_px2 (H, W, 2, 2) of the projection at distance_mm; NaN where nobody has looked."""
 
     distance_mm: float
     pixels: Float
@@ -26,7 +27,7 @@ class UncertaintyMap:
 
     @property
     def sigma_px(self) -> Float:
-        """(H, W): root mean square of the two coordinates' standard uncertainties."""
+        """(H, W): root mean square of the two coordinates' standard uncertainties; NaN where nobody has looked."""
         return np.sqrt(np.trace(self.covariance_px2, axis1=-2, axis2=-1) / 2)
 
 
@@ -38,16 +39,16 @@ def grid_pixels(image_size: tuple[int, int], columns: int) -> Float:
 
 
 def projection_uncertainty(adjustment: Adjustment, distance_mm: float, columns: int = 25) -> UncertaintyMap:
-    """The covariance of the projection on a grid of pixels, of points at Z = distance_mm."""
+    """The covariance of the projection on a grid of pixels, of points at Z = distance_mm; NaN where not seen."""
     lens = adjustment.scene.lens
     pixels = grid_pixels(lens.image_size, columns)
     slopes = lens.slopes(pixels.reshape(-1, 2))
     points = np.column_stack([slopes, np.ones(len(slopes))]) * distance_mm
     jacobian = _jacobian(adjustment, points, pixels.reshape(-1, 2))
     covariance = adjustment.covariance[: jacobian.shape[2], : jacobian.shape[2]]
-    return UncertaintyMap(
-        distance_mm, pixels, (jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).reshape(*pixels.shape, 2)
-    )
+    found = (jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).reshape(*pixels.shape, 2)
+    known = seen(pixels, adjustment.hull_px)[..., None, None]
+    return UncertaintyMap(distance_mm, pixels, np.where(known, found, np.nan))
 
 
 def _jacobian(adjustment: Adjustment, points_mm: Float, pixels: Float) -> Float:
@@ -72,7 +73,8 @@ def _jacobian(adjustment: Adjustment, points_mm: Float, pixels: Float) -> Float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Difference:
-    """pixels (H, W, 2), shift_px (H, W, 2): where the second camera sees what the first one sees at the pixels."""
+    """pixels (H, W, 2), shift_px (H, W, 2): where the second camera sees what the first one sees at the pixels; NaN
+    where one of them saw no marker."""
 
     distance_mm: float
     pixels: Float
@@ -80,8 +82,8 @@ class Difference:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square per coordinate over the grid."""
-        return float(np.sqrt(np.mean(self.shift_px**2)))
+        """Root mean square per coordinate over what of the grid both have seen."""
+        return float(np.sqrt(np.nanmean(self.shift_px**2)))
 
 
 def difference(first: Adjustment, second: Adjustment, distance_mm: float, columns: int = 25) -> Difference:
@@ -90,7 +92,9 @@ def difference(first: Adjustment, second: Adjustment, distance_mm: float, column
     pixels = grid_pixels(first.scene.lens.image_size, columns)
     slopes = first.scene.lens.slopes(pixels)
     points = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1) * distance_mm
-    return Difference(distance_mm, pixels, second.scene.lens.project(points @ turn.T + shift) - pixels)
+    moved_px = second.scene.lens.project(points @ turn.T + shift) - pixels
+    known = seen(pixels, first.hull_px) & seen(pixels, second.hull_px)
+    return Difference(distance_mm, pixels, np.where(known[..., None], moved_px, np.nan))
 
 
 def _between(first: Adjustment, second: Adjustment) -> tuple[Float, Float]:

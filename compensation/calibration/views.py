@@ -32,6 +32,7 @@ from compensation.calibration.opencv import calibrate_opencv
 from compensation.calibration.pinhole import Pinhole
 from compensation.calibration.pose import find_pose
 from compensation.calibration.rotation import crosses
+from compensation.drift.hull import convex_hull
 from foundation.errors import CalibrationError
 
 POSE = 6
@@ -90,6 +91,13 @@ class ViewCalibration:
     covariance: Float
     residuals_px: Float
     discrepancy_px: float
+
+    @property
+    def hull_px(self) -> Float:
+        """(H, 2): of the markers that were used, where they are computed to be seen."""
+        scene = self.scene
+        points_mm = np.einsum("pij,nj->pni", scene.rotations, scene.points_mm) + scene.translations_mm[:, None]
+        return convex_hull(scene.lens.project(points_mm[np.isfinite(self.residuals_px[:, :, 0])]))
 
     @property
     def lens_sigma(self) -> Float:

@@ -6,6 +6,7 @@ import importlib.metadata
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from compensation.calibration.calibrate import Calibration, Model, calibrate
@@ -50,6 +51,9 @@ def calibrate_session(
     ),
     straightness_um: Annotated[float, typer.Option(min=0, help="Of the table across its axis; 0: straight.")] = 0.0,
     wobble_arcmin: Annotated[float, typer.Option(min=0, help="Of the table's tilt; 0: none.")] = 0.0,
+    keep_rays: Annotated[
+        bool, typer.Option("--keep-rays", help="Write the ray model, too, when it does not describe the lens.")
+    ] = False,
     camera: CameraName = None,
     incomplete: Incomplete = False,
 ) -> None:
@@ -68,7 +72,7 @@ def calibrate_session(
     with progress("find markers", opened.frame_count) as shown:
         positions = observe_positions(opened, used, shown)
     found = calibrate(positions, used, sigma, model)
-    file = _file(opened, used.name, found)
+    file = _file(opened, used.name, found, keep_rays=keep_rays)
     lines = [summary(file, used)]
     page = None if report is None else report_page(file, found)
     if report is not None and page is not None:
@@ -99,6 +103,9 @@ def summary(file: CameraFile, target: Target) -> str:
     if (apart_px := file.uncertainty.halves_rms_px) is not None:
         lines.append(f"the halves differ by {1e3 * apart_px:z.2f} mpx RMS at {file.uncertainty.distance_mm:z.0f} mm")
     lines += file.not_known
+    lines += _projection(file)
+    if file.rays_doubt:
+        lines.append(f"{file.rays_doubt}{'' if file.rays else '. It is not written; --keep-rays writes it'}")
     refit = refit_radtan(file.lens)
     lines.append(
         f"Kalibr's model without k3 differs by {1e3 * refit.rms_px:z.2f} mpx RMS, {1e3 * refit.worst_px:z.1f} at most"
@@ -107,11 +114,24 @@ def summary(file: CameraFile, target: Target) -> str:
     return "\n".join(lines)
 
 
-def _file(session: Session, target_name: str, found: Calibration) -> CameraFile:
+def _projection(file: CameraFile) -> list[str]:
+    """Where the projection is known how well, and where nobody has looked."""
+    sigma_px = np.array(file.uncertainty.sigma_px, np.float64)
+    if not np.isfinite(sigma_px).any():
+        return []
+    unseen = "" if not file.uncertainty.not_seen else f"; {100 * np.isnan(sigma_px).mean():.0f} % of the picture: "
+    return [
+        f"the projection is known to {1e3 * np.nanmin(sigma_px):z.2f} to {1e3 * np.nanmax(sigma_px):z.2f} mpx "
+        f"(standard uncertainty) at {file.uncertainty.distance_mm:z.0f} mm{unseen}{file.uncertainty.not_seen}"
+    ]
+
+
+def _file(session: Session, target_name: str, found: Calibration, *, keep_rays: bool) -> CameraFile:
     return camera_file(
         found,
         camera_serial=serial_of(session),
         session_ids=(session.metadata.get("session_id", ""),),
         target_name=target_name,
         software_version=importlib.metadata.version("thermostand"),
+        keep_rays=keep_rays,
     )

@@ -14,7 +14,7 @@ from compensation.calibration.exports import EXPORTS, write_exports
 from compensation.calibration.least_squares import Float
 from compensation.calibration.model_scores import known_or_why
 from compensation.calibration.pinhole import NAMES
-from compensation.calibration.view_uncertainty import in_words
+from compensation.calibration.view_uncertainty import Known, known
 from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
 from compensation.commands.options import MegapixelsOption, installed_target, say_left_out
 from foundation.command_app import App
@@ -68,15 +68,16 @@ def calibrate_photographs(
         with progress("find markers", len(images)) as report:
             seen = views_of([(path, path.name) for path in images], board, failures, doubtful, report)
         say_left_out("not used:", failures, doubtful)
-        views, known = seen.part(np.asarray(seen.seen.any(axis=1))), known_board(board)
-        found = calibrate_views(views, known)
+        views, given = seen.part(np.asarray(seen.seen.any(axis=1))), known_board(board)
+        found = calibrate_views(views, given)
         at_mm = distance_mm or float(np.mean(found.scene.translations_mm[:, 2]))
-        held_out_px, unknown = known_or_why(lambda: cross_validated_px(views, known))
-        lines = [summary(found, views, held_out_px, at_mm, board)]
+        held_out_px, unknown = known_or_why(lambda: cross_validated_px(views, given))
+        projection = known(found, at_mm)
+        lines = [summary(found, views, held_out_px, projection, board)]
         if unknown:
             lines.append(f"how well pictures that were held out are met is not known: {unknown}")
         lens = dict(zip(NAMES, found.scene.lens.vector, strict=False))
-        data = {"lens": lens, "lens_sigma": found.lens_sigma, "rms_px": found.rms_px}
+        data = {"lens": lens, "lens_sigma": found.lens_sigma, "rms_px": found.rms_px, "projection": projection}
         checked = {"held_out_px": held_out_px, "held_out_not_known": unknown}
         more = {"discrepancy_px": found.discrepancy_px, "not_used": failures, "doubtful": doubtful, "exports": export}
         write_exports(export, found.scene.lens, "camera", found.rms_px)
@@ -84,7 +85,7 @@ def calibrate_photographs(
 
 
 def summary(
-    found: ViewCalibration, views: Views, held_out_px: float | None, distance_mm: float, target: Target | BoardOfCorners
+    found: ViewCalibration, views: Views, held_out_px: float | None, projection: Known, target: Target | BoardOfCorners
 ) -> str:
     """The calibration in a few lines."""
     lens = found.scene.lens
@@ -101,7 +102,7 @@ def summary(
         f"residual {1e3 * found.rms_px:.1f} mpx per coordinate, detection sigma {1e3 * sigma_px:.1f} mpx, discrepancy "
         f"{1e3 * found.discrepancy_px:.1f} mpx",
         *([] if held_out_px is None else [f"pictures that were held out: {1e3 * held_out_px:.1f} mpx per coordinate"]),
-        in_words(found, distance_mm),
+        projection.text,
         f"the markers are {1e3 * float(np.sqrt(np.mean(moved**2))):.0f} um off their places in the plane (allowed: "
         f"{1e3 * float(found.board.sigma_mm[:, 0].mean()):.0f}), {1e3 * found.warp_mm:.0f} um off a plane (allowed: "
         f"{1e3 * target.flatness_mm:.0f})",

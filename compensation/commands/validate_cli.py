@@ -23,7 +23,7 @@ from compensation.validation3d.validation_text import summary
 from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.files import check_writable, write_whole
-from foundation.output import show
+from foundation.output import say, show
 from recording.reading.session import Session
 
 app = App()
@@ -53,6 +53,9 @@ def validate_session(
     """
     beside = _numbers_beside(out)
     file, drift = load_camera(camera), load_model(model)
+    calibrated = camera_of(file, lens)
+    if lens is LensModel.RAYS and file.rays_doubt:
+        say(file.rays_doubt)
     geometry = None if budget is None else load_geometry(budget)
     opened = Session.open(session)
     observations = finding.observed([session], name_of(opened, file.camera_serial))
@@ -64,7 +67,7 @@ def validate_session(
             return None
         return stand_part(opened, observations, frames, geometry, distances_mm)
 
-    found = validate(observations, frames, camera_of(file, lens), drift, stand_at)
+    found = validate(observations, frames, calibrated, drift, stand_at)
     write_whole(out, validation_page(found))
     write_whole(beside, as_json(found))
     show(json.loads(as_json(found)), [summary(found)])

@@ -23,7 +23,8 @@ _FIGURES = (
         figures.uncertainty_map,
         "uncertainty",
         "Standard uncertainty of the projection at the mean distance, and how far the calibrations of the two halves "
-        "of the positions differ there. White dots are the markers.",
+        "of the positions differ there. White dots are the markers; where it is hatched, none was near, and nothing is "
+        "known.",
     ),
     (figures.model_scores, "scores", "Models at positions they were not fitted to; bars are standard errors."),
     (figures.rays_against_pinhole, "rays", "Where the ray model sees what the pinhole sees, at the mean distance."),
@@ -72,13 +73,17 @@ def _facts(file: CameraFile) -> Facts:
             ("Detection sigma", f"{1e3 * fit.detection_sigma_px:z.2f} mpx per coordinate, mean of a position's frames"),
             ("Unexplained", f"{1e3 * fit.discrepancy_px:z.2f} mpx per coordinate beyond noise and priors"),
             ("Markers", f"{fit.markers} at {len(file.table.linear_mm)} positions, {fit.outliers} outliers left out"),
-            (
-                "Ray model",
-                f"degree {file.rays.degree}, {file.rays.range_mm[0]:z.0f} to {file.rays.range_mm[1]:z.0f} mm",
-            ),
+            ("Ray model", _rays(file)),
             ("Halves", "not known" if apart_px is None else f"{1e3 * apart_px:z.2f} mpx RMS apart"),
         ]
     )
+
+
+def _rays(file: CameraFile) -> str:
+    if (rays := file.rays) is None:
+        return f"not in the camera file; {file.rays_doubt}"
+    extent = f"degree {rays.degree}, {rays.range_mm[0]:z.0f} to {rays.range_mm[1]:z.0f} mm"
+    return f"{extent}; {file.rays_doubt}" if file.rays_doubt else extent
 
 
 def _scores(file: CameraFile) -> Table:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.calibration.camera_file import CameraFile
+from compensation.calibration.model_scores import ray_name
 from compensation.calibration.pose import find_pose
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.training import frame_states
@@ -69,9 +70,12 @@ class Validation:
 
 
 def camera_of(file: CameraFile, lens: LensModel) -> Camera:
-    """The calibrated camera and target of a camera file."""
-    name = file.model if lens is LensModel.PINHOLE else f"rays, degree {file.rays.degree}"
-    return Camera(file.lens if lens is LensModel.PINHOLE else file.ray_lens, name, file.adjusted_board)
+    """The calibrated camera and target of a camera file; CalibrationError when it has no ray model, and that is
+    asked for."""
+    if lens is LensModel.PINHOLE:
+        return Camera(file.lens, file.model, file.adjusted_board)
+    rays = file.ray_lens
+    return Camera(rays, ray_name(rays.degree), file.adjusted_board)
 
 
 def check_same(observations: Observations, file: CameraFile, model: DriftModel) -> None:

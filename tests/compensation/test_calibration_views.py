@@ -13,13 +13,14 @@ from typer.testing import CliRunner
 
 from compensation.calibration.board import Board
 from compensation.calibration.exports import EXPORTS
-from compensation.calibration.view_uncertainty import in_words, projection_sigma_um
+from compensation.calibration.seen_area import NOT_SEEN
+from compensation.calibration.view_uncertainty import known, projection_sigma_um
 from compensation.calibration.views import ViewCalibration, Views, calibrate_views, cross_validated_px
 from compensation.cli import app
 from foundation.errors import CalibrationError
 
 from .calibration_cases import board
-from .calibration_truth import SIZE, Laboratory, Truth, draw
+from .calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw
 from .rendered import photograph, render
 from .test_markers import HALF
 
@@ -29,6 +30,16 @@ TRUE = np.array([7246.0, 7246.0, 1231.8, 1015.4, -0.12, 0.35, 2.0e-4, -3.0e-4, 0
 def seen(laboratory: Laboratory, every: int = 2) -> Views:
     centres = laboratory.centres_px[::every]
     return Views(centres, np.tile(laboratory.covariance_px2, (*centres.shape[:2], 1, 1)), SIZE)
+
+
+def wide_angle_views() -> tuple[Views, Board]:
+    """A lens of 100 deg whose target is in the middle of all pictures, and its board."""
+    camera = TrueCamera(f_px=1000.0, k1=-0.25, k2=0.1)
+    laboratory = draw(Truth(seed=1, camera=camera, distance_mm=400.0))
+    views = seen(laboratory)
+    outside = ~((views.centres_px > 0) & (views.centres_px < SIZE)).all(axis=2)
+    views.centres_px[outside] = np.nan
+    return views, board(laboratory)
 
 
 def chi2(found: ViewCalibration) -> float:
@@ -76,8 +87,22 @@ def test_the_uncertainty_is_stated_in_words_larger_at_the_corners_and_for_fewer_
         middle, corner = projection_sigma_um(found, pixels, 826.0)
         assert corner > 2 * middle
     assert np.all(projection_sigma_um(few, pixels, 826.0) > 1.2 * projection_sigma_um(many, pixels, 826.0))
-    assert in_words(many, 826.0).startswith("at 826 mm a point is known to 0.")
-    assert "um (k = 2) in the middle of the picture, to " in in_words(many, 826.0)
+    told = known(many, 826.0)
+    assert told.middle_um == pytest.approx(2 * projection_sigma_um(many, pixels, 826.0)[0])
+    assert told.worst_seen_um >= max(um for um in told.corners_um if um is not None)
+    seen_all = replace(told, corners_um=(1.0,) * 4, not_seen="")
+    assert ("at its worst corner" in seen_all.text, NOT_SEEN in seen_all.text) == (True, False)
+
+
+def test_of_corners_that_nobody_saw_nothing_is_said():
+    """A wide lens and a target in its middle: the corners are beyond all markers."""
+    views, given = wide_angle_views()
+    found = calibrate_views(views, given)
+    told = known(found, 400.0)
+    assert told.corners_um == (None,) * 4
+    assert told.middle_um is not None
+    assert told.middle_um < told.worst_seen_um < 100 * told.middle_um
+    assert NOT_SEEN in told.text
 
 
 def test_an_outlier_is_left_out():
@@ -111,7 +136,7 @@ def test_the_command_calibrates_photographs_and_says_how_well(tmp_path: Path):
     assert result.exit_code == 0, result.output
     assert "not used: wall.png: found 0 of 54 markers" in result.stderr
     assert "378 markers in 7 pictures" in result.stdout
-    assert "at 1000 mm a point is known to" in result.stdout
+    assert "a point at 1000 mm is known to" in result.stdout
     assert "orientation: paper-9x6 looks the same after half a turn" in result.stdout
     words = next(line for line in result.stdout.splitlines() if line.strip().startswith("fx")).split()
     assert abs(float(words[1]) - HALF.f_px) < 4 * float(words[3])
@@ -122,6 +147,9 @@ def test_the_command_calibrates_photographs_and_says_how_well(tmp_path: Path):
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert (found["held_out_px"], bool(found["held_out_not_known"])) == (None, True)
+    projection = found["projection"]
+    assert projection["middle_um"] < projection["worst_seen_um"]
+    assert bool(projection["not_seen"]) == (None in projection["corners_um"])
     assert sorted(path.name for path in (tmp_path / "few").iterdir()) == sorted(EXPORTS)
     assert abs(found["lens"]["fx"] - HALF.f_px) < 4 * found["lens_sigma"][0]
     result = CliRunner().invoke(app, [*few[:5], *few[6:8], "--export", str(tmp_path / "none")])

@@ -224,7 +224,7 @@ def test_pinhole_and_rays_agree(laboratory: Laboratory, file: CameraFile, model:
     observed, frames = validation_session(laboratory, TRUTH, drift, temperatures_degC=(24.0, 43.0))
     pinhole, rays = (validate(observed, frames, camera_of(file, lens), model) for lens in LensModel)
     assert rays.after.translation_um == pytest.approx(pinhole.after.translation_um, abs=0.3)
-    assert (pinhole.lens, rays.lens) == (file.model, f"rays, degree {file.rays.degree}")
+    assert (pinhole.lens, rays.lens) == (file.model, f"rays, degree {file.ray_lens.degree}")
 
 
 def test_camera_model_and_session_must_belong_together(laboratory: Laboratory, file: CameraFile, model: PaperModel):

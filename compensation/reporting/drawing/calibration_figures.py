@@ -9,6 +9,7 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from compensation.calibration.adjustment import Adjustment
 from compensation.calibration.calibrate import Calibration
@@ -177,5 +178,15 @@ def _table_corrections(axes: Axes, adjustment: Adjustment) -> None:
 
 
 def _contours(figure: Figure, axes: Axes, pixels: Float, values: Float, label: str) -> None:
-    drawn = axes.contourf(pixels[..., 0], pixels[..., 1], values, levels=12, cmap="viridis")
-    figure.colorbar(drawn, ax=axes, label=label, orientation="horizontal", pad=0.02, shrink=0.9)
+    """Hatched grey where values are NaN."""
+    columns, rows = pixels[..., 0], pixels[..., 1]
+    if np.isfinite(values).any():
+        drawn = axes.contourf(columns, rows, np.ma.masked_invalid(values), levels=12, cmap="viridis")
+        figure.colorbar(drawn, ax=axes, label=label, orientation="horizontal", pad=0.02, shrink=0.9)
+    if np.isnan(values).any():
+        patch = Rectangle(
+            (0, 0), 1, 1, label="not seen here", facecolor="#d9d9d9", edgecolor=GREY, hatch="///", zorder=-1
+        )
+        patch.set_transform(axes.transAxes)
+        axes.add_patch(patch)
+        legend_above(axes)
