@@ -41,6 +41,9 @@ def shaped(name: str, values: object, shape: tuple[int, ...]) -> Float:
     return array
 
 
+_IMAGES = 1000
+
+
 def check_covariance(name: str, covariance: Float) -> None:
     """Of (n, n) or several of them (..., n, n): no variance below 0, symmetric and positive semidefinite within
     rounding. Judged by the correlations: parameters of different units have variances of different sizes."""
@@ -62,12 +65,13 @@ def check_covariance(name: str, covariance: Float) -> None:
 
 
 def check_within_image(name: str, moves_px: ArrayLike, image_size: tuple[int, int]) -> None:
-    """moves_px: how far something moves a point, px."""
-    greatest, limit = float(np.max(np.abs(moves_px))), max(image_size)
-    if not greatest <= limit:
+    """moves_px: how far each term moves a point, px. Terms of a fit to few temperatures cancel each other: one of a
+    table of centres was five images wide. One of a thousand images is no fit."""
+    greatest, width = float(np.max(np.abs(moves_px))), max(image_size)
+    if not greatest <= _IMAGES * width:
         raise ValueError(
-            f"{name}: they move points by {greatest:.3g} px; the image has {limit}, and what moves a point further "
-            "than that corrects nothing"
+            f"{name}: they move points by {greatest:.3g} px; the image has {width}, and what moves a point a thousand "
+            "times as far corrects nothing"
         )
 
 

@@ -73,7 +73,7 @@ def circle(corners: int) -> list[tuple[float, float]]:
 
 THERMAL: dict[str, tuple[Change, str]] = {
     "coefficient": (put("coefficients_px", 2, 3, value=1e300), "coefficients_px: they move points by 1e\\+300 px"),
-    "coefficient that is an image": (put("coefficients_px", 0, 0, value=700), "the image has 640"),
+    "coefficient that is an image": (put("coefficients_px", 0, 0, value=700e3), "the image has 640"),
     "reference": (put("reference_features", 0, value=-1e9), "reference_features: they move points"),
     "negative variance": (put("coefficient_covariance_px2", 3, 3, value=-1e-6), "variance in row 3 is -1e-06"),
     "not symmetric": (off_centre("coefficient_covariance_px2", 5e-7), "coefficient_covariance_px2: not symmetric"),
