@@ -169,8 +169,8 @@ class RunState:
         return next((planned for planned in self.plan if planned.step_id == step_id), None)
 
     def owed_ns(self, soak: PlannedStep) -> int:
-        """What the soak has not earned yet of its longest time; nothing when it has ended."""
-        if soak.step_id in self.soaked:
+        """What the soak has not earned yet of its longest time; nothing when it has ended, or is left out."""
+        if soak.step_id in self.soaked or soak.step_id in self.skipped:
             return 0
         duration_ns = duration_of(soak)
         earned_ns = self.earned_ns.get(soak.step_id, duration_ns if soak.step_id in self.done else 0)
