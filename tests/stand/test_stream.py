@@ -216,3 +216,19 @@ async def test_a_viewer_that_sends_is_disconnected_and_takes_no_stop_away(tmp_pa
         assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
         assert await quiet.ping()
     assert [verb for _, verb, _ in desk.orders] == ["stop"]
+
+
+async def test_between_the_messages_of_a_replay_others_have_their_turn():
+    viewer, turns = streams.Viewer(streams.Message(seq, "event", "{}") for seq in range(100)), 0
+
+    async def take_turns() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    other = asyncio.create_task(take_turns())
+    for _ in range(100):
+        await viewer.next()
+    other.cancel()
+    assert turns >= 99

@@ -119,6 +119,7 @@ class Viewer:
 
     async def next(self) -> str:
         """The next message; waits for one."""
+        await asyncio.sleep(0)  # in a replay, too, others have their turn, and it is seen when the viewer leaves
         while not (self._lost or self._waiting or self._state):
             self._something.clear()
             await self._something.wait()
