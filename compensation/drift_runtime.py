@@ -35,6 +35,9 @@ SPAN_K, HULL_MARGIN_PX = 20.0, 1.0
 COLDEST_degC, HOTTEST_degC = -273.15, 1000.0
 MOST_CORNERS = 2000
 """Of a hull: that of a night's markers has about 40. Each point is compared with each corner."""
+MOST_IMAGES = 1000
+"""The terms of a correction are not larger in all: those of a fit to few temperatures cancel each other, and of a table
+of centres they were five images."""
 LATTICE_PX, ROUNDS = 16, 4
 """Maps are worked out every 16 px; the shift changes by some 1e-4 px per px, and each round of its inverse gains four
 digits."""
@@ -358,10 +361,9 @@ def _check(model):
             raise ValueError(f"{name}: not finite numbers of shape {shapes[name]}")
     if not 3 <= len(model["hull_px"]) <= MOST_CORNERS:
         raise ValueError(f"hull_px: {len(model['hull_px'])} corners, not 3 to {MOST_CORNERS}")
-    # Terms of a fit to few temperatures cancel each other: as in sound_values.check_within_image.
-    moved = np.abs(np.array(model["coefficients_px"], float)).sum(axis=1).max(initial=0.0)
-    if not (min(size) > 0 and moved <= 1000 * max(size)):
-        raise ValueError(f"coefficients_px: they move points by {moved:.3g} px, in an image of {max(size)}")
+    terms_px = np.abs(np.array(model["coefficients_px"], float)).sum(axis=1).max(initial=0.0)
+    if not (min(size) > 0 and terms_px <= MOST_IMAGES * max(size)):
+        raise ValueError(f"coefficients_px: terms of {terms_px:.3g} px, for an image of {max(size)}")
 
 
 def is_temperature(degC):

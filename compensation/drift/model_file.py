@@ -36,6 +36,7 @@ from compensation.sound_values import (
     Size,
     check_covariance,
     check_order,
+    check_terms,
     check_within_image,
     shaped,
 )
@@ -222,10 +223,9 @@ def _paper(file: PaperFile) -> PaperModel:
         raise ValueError(f"scores: none for degree {file.degree}")
     coefficients = shaped("coefficients_px", file.coefficients_px, (2, count))
     covariance = shaped("coefficient_covariance_px2", file.coefficient_covariance_px2, (2, count, count))
-    # No term is greater than 1 within image and calibrated range.
-    check_within_image("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
+    check_terms("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
     check_covariance("coefficient_covariance_px2", covariance)
-    return PaperModel(
+    model = PaperModel(
         facts=_facts(file),
         degree=file.degree,
         coefficients=coefficients,
@@ -234,6 +234,9 @@ def _paper(file: PaperFile) -> PaperModel:
         scores=file.scores,
         candidates=file.candidates,
     )
+    moved_px = [model.shift(model.facts.hull_px, degC) for degC in file.camera_range_degC]
+    check_within_image("coefficients_px", moved_px, file.image_size_px)
+    return model
 
 
 def _thermal(file: ThermalFile) -> ThermalModel:
@@ -246,7 +249,7 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         covariance[0] + covariance[1] if leverage is None else shaped("leverage_matrix_px2", leverage, (count, count))
     )
     # Features are about 1 at 20 K from the reference, motions at the image's edge.
-    check_within_image("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
+    check_terms("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
     check_within_image("reference_features", coefficients @ reference_features, file.image_size_px)
     check_covariance("coefficient_covariance_px2", covariance)
     check_covariance("leverage_matrix_px2", leverage_matrix)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from compensation import cli
 from compensation.centres_table import observations_of_table
 from compensation.drift.model_file import load_model
+from compensation.drift_runtime import Drift
 from foundation.errors import SessionError
 
 from .drawn_cameras import drawn_camera
@@ -42,6 +43,11 @@ def test_a_table_is_fitted_without_session_and_stand(tmp_path: Path) -> None:
     model = load_model(out)
     assert model.facts.session_ids == ("centres",)
     assert np.abs(model.shift(np.array([[1200.0, 1000.0]]), 60.0)).max() > 0.1
+    runtime_model = tmp_path / "runtime"
+    exported = CliRunner().invoke(cli.app, ["export", str(out), "-o", str(runtime_model)])
+    assert exported.exit_code == 0, exported.output
+    (file,) = runtime_model.glob("*.json")
+    assert isinstance(Drift.load(file), Drift)  # its terms cancel each other there, too
 
 
 def test_a_table_gives_what_it_says(tmp_path: Path) -> None:

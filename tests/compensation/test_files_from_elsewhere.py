@@ -72,8 +72,8 @@ def circle(corners: int) -> list[tuple[float, float]]:
 
 
 THERMAL: dict[str, tuple[Change, str]] = {
-    "coefficient": (put("coefficients_px", 2, 3, value=1e300), "coefficients_px: they move points by 1e\\+300 px"),
-    "coefficient that is an image": (put("coefficients_px", 0, 0, value=700e3), "the image has 640"),
+    "coefficient": (put("coefficients_px", 2, 3, value=1e300), "coefficients_px: terms of 1e\\+300 px"),
+    "coefficient that is an image": (put("coefficients_px", 0, 0, value=700e3), "for an image of 640"),
     "reference": (put("reference_features", 0, value=-1e9), "reference_features: they move points"),
     "negative variance": (put("coefficient_covariance_px2", 3, 3, value=-1e-6), "variance in row 3 is -1e-06"),
     "not symmetric": (off_centre("coefficient_covariance_px2", 5e-7), "coefficient_covariance_px2: not symmetric"),
@@ -98,7 +98,8 @@ THERMAL: dict[str, tuple[Change, str]] = {
     ),
 }  # fmt: skip
 PAPER: dict[str, tuple[Change, str]] = {
-    "coefficient": (put("coefficients_px", 1, 0, value=-1e300), "coefficients_px: they move points by 1e\\+300 px"),
+    "coefficient": (put("coefficients_px", 1, 0, value=-1e300), "coefficients_px: terms of 1e\\+300 px"),
+    "more than an image": (put("coefficients_px", 1, 0, value=700.0), "they move points by .* the image has 640"),
     "negative variance": (put("coefficient_covariance_px2", 1, 2, 2, value=-1.0), "variance in row 2 is -1"),
     "range": (put("camera_range_degC", value=[30.0, 1e6]), "camera_range_degC"),
 }
@@ -123,7 +124,7 @@ CAMERA: dict[str, tuple[Change, str]] = {
     "map": (lambda data: data["uncertainty"]["sigma_px"].pop(), "sigma_px: shape"),
 }
 RUNTIME: dict[str, tuple[Change, str]] = {
-    "coefficient": (put("coefficients_px", 2, 3, value=1e300), "coefficients_px: they move points"),
+    "coefficient": (put("coefficients_px", 2, 3, value=1e300), "coefficients_px: terms of"),
     "infinite": (put("coefficients_px", 2, 3, value=float("inf")), "coefficients_px: not finite"),
     "null": (put("coefficients_px", 2, 3, value=None), "coefficients_px: not "),
     "ragged": (lambda data: data["coefficients_px"][0].pop(), "coefficients_px: not numbers"),
