@@ -228,7 +228,7 @@ Step = (
 AnySoak = Soak | SoakUntilSettled
 
 
-def impossible(soak: Soak) -> str:
+def find_fault(soak: Soak) -> str:
     """Why the soak cannot be guaranteed, as a clause; "" when it can."""
     if soak.max_s is not None and soak.max_s < soak.duration_s:
         return f"max_s {soak.max_s:g} is its longest time; it must be at least duration_s {soak.duration_s:g}"
@@ -332,7 +332,7 @@ def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
         least = 1 if name == "frames" else 0 if name.endswith("_s") or name == "band_K" else -math.inf
         if isinstance(value, int | float) and not least <= value < math.inf:
             raise ConfigError(f"{kind}: {name} is {value}")
-    if isinstance(step, Soak) and (reason := impossible(step)):
+    if isinstance(step, Soak) and (reason := find_fault(step)):
         raise ConfigError(f"{kind}: {reason}")
     return step
 

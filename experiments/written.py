@@ -37,7 +37,7 @@ from experiments.steps import (
     StartChamber,
     Step,
     StopChamber,
-    impossible,
+    find_fault,
 )
 from foundation.documents import Document
 
@@ -93,7 +93,7 @@ class SoakEntry(Guaranteed, _Timed):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        if reason := impossible(self.step):
+        if reason := find_fault(self.step):
             raise ValueError(reason)
         return self
 

@@ -65,7 +65,7 @@ Values   An empty cell is what the device does not measure; nan is what it could
 Frames   Columns of frames.csv: file (the image here, else the recorded segment that has it); camera; step_id, the step
          of the plan that took it; role, what for; superseded, yes when the capture was begun again later;
          set_point_degC of the chamber; camera_temperature_degC, the camera's own; flags, why a fit leaves it out
-         (temperature_in_doubt); for each thermometer the last
+         (temperature_in_doubt, unsettled); for each thermometer the last
          reading (NAME_degC, in degrees Celsius) and how old it was (NAME_age_s, in seconds); NAME_position_mm or
          NAME_position_deg of each stage, in millimetres or degrees, interpolated to the middle of the exposure.
 Texts    Cells of the CSV tables are safe for spreadsheets, also of a stranger's session. A text that a spreadsheet

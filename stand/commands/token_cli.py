@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated, cast
 
 import typer
 
@@ -13,9 +13,6 @@ from foundation.errors import ConfigError
 from foundation.output import output, say, show
 from stand.commands.reached import ConfigOption, DirectoryArgument, reached
 from stand.serving.client import API, Answer
-
-if TYPE_CHECKING:
-    pass
 
 app = App(
     no_args_is_help=True,

@@ -173,7 +173,8 @@ def _in_the_dark(step: Step, found: Situation) -> str:
 
 def _warning(step: Step, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
     """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then. Of a
-    cool-down: that it is too short for a camera that was on."""
+    cool-down: that it is too short for a camera that was on. Of a soak that is expected to take expected_s: that it
+    will not end in its time."""
     if isinstance(step, CoolDown):
         needed_s = estimate_s(replace(step, max_s=math.inf), 0.0)
         too_short = f"ends after {_minutes(step.max_s)}; the camera needs {_minutes(needed_s)} to be within its band"
@@ -193,7 +194,7 @@ def _warning(step: Step, approach: _Approach, chamber: ChamberModel, expected_s:
 
 
 def _longer(soak: Soak, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
-    """Of a soak that will not end in its time: until when it goes on, and that it ends without its band."""
+    """Until when a soak goes on beyond its time, or that it ends with the chamber outside its band; "" otherwise."""
     if expected_s <= soak.duration_s:
         return ""
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC, soak.band_K) - approach.age_s

@@ -16,7 +16,7 @@ from foundation.items import Event, StepMark, StepState
 from recording.reading.contents import PLAN_CHANGED
 from stand.estimating.estimate import PricedStep
 
-SOAK_LONGER = "soak_longer"  # the event that a soak goes on beyond its time, by_s more
+SOAK_LONGER = "soak_longer"  # the event that a soak goes on beyond its time, for by_s at least
 _REMEMBERED = 9  # the last measurements of a kind of work count
 _LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
 _LEAST_WITHIN_S = 60.0
@@ -51,6 +51,7 @@ class Eta:
         self._overhead_s = {step.work: step.duration_s - step.stated_s for step in steps}
         self._seen_s = {work: deque([usual_s], _REMEMBERED) for work, usual_s in self._overhead_s.items()}
         self._running: PricedStep | None = None
+        self.goes_on = False  # the soak under way, beyond its time
         self._begun_ns = 0
         self._reasons: set[object] = set()
         self._held_since_ns: int | None = None
@@ -60,6 +61,7 @@ class Eta:
 
     def mark(self, mark: StepMark) -> None:
         """A step began or ended."""
+        self.goes_on = False
         if not 0 <= mark.index < len(self._steps):
             return
         if mark.state is StepState.STARTED:
@@ -117,9 +119,8 @@ class Eta:
 
     def event(self, event: Event) -> None:
         """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further.
-        `plan_changed`: an operator has changed what is still to be done. `soak_longer`: a soak goes on because the
-        chamber was not in its band. `to_ambient`, `at_ambient`, `not_at_ambient`:
-        the way back begins or ends."""
+        `plan_changed`: an operator has changed what is still to be done. `soak_longer`: the soak under way goes on
+        beyond its time. `to_ambient`, `at_ambient`, `not_at_ambient`: the way back begins or ends."""
         if event.kind == "held":
             self._held_since_ns = event.time_ns if self._held_since_ns is None else self._held_since_ns
             self._reasons.add(event.data.get("reason"))
@@ -129,6 +130,7 @@ class Eta:
                 self._held_ns += event.time_ns - self._held_since_ns
                 self._held_since_ns = None
         elif event.kind in (PLAN_CHANGED, SOAK_LONGER):
+            self.goes_on |= event.kind == SOAK_LONGER
             self._change(event.data)
         elif event.kind == "to_ambient":
             self._after_since_ns = event.time_ns

@@ -10,7 +10,7 @@ from foundation.clock import Clock, seconds_ns, utc_offset_ns
 from foundation.items import Batch, Event, Item, StepMark
 from foundation.readings import Quality
 from recording.writing.recorder import Recorder
-from stand.estimating.eta import SOAK_LONGER, Eta
+from stand.estimating.eta import Eta
 from stand.estimating.run_estimate import Night
 from stand.fault import Fault
 from stand.gate import Gate, Phase
@@ -57,7 +57,7 @@ class StatusBoard:
         self._recorder = recorder
         self._clock = clock
         self._step = 0
-        self._doing, self._goes_on = "", False
+        self._doing = ""
         self._state: State = STATES[stop.phase]
         self._since_ns = clock.now_ns()
         self._since_utc_offset_ns = self._warning_utc_offset_ns = utc_offset_ns(clock)
@@ -71,10 +71,9 @@ class StatusBoard:
             case StepMark():
                 self.eta.mark(item)
                 self._step = item.index + 1
-                self._doing, self._goes_on = mark_in_words(item.kind, item.parameters), False
+                self._doing = mark_in_words(item.kind, item.parameters)
             case Event():
                 self.eta.event(item)
-                self._goes_on |= item.kind == SOAK_LONGER
                 if item.level != "info":
                     self._warning, self._warning_utc_offset_ns = item, utc_offset_ns(self._clock)
             case Batch():
@@ -118,7 +117,7 @@ class StatusBoard:
 
     def _doing_now(self) -> str:
         """The step under way in words; before that a camera that was off comes to equilibrium."""
-        return doing_in_words(self._doing, self._soaked_again_s(), goes_on=self._goes_on)
+        return doing_in_words(self._doing, self._soaked_again_s(), goes_on=self.eta.goes_on)
 
     def left_s(self, now_ns: int) -> float:
         """How long the run still takes, from now on."""

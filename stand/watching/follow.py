@@ -13,7 +13,7 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality
 from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
-from stand.estimating.eta import SOAK_LONGER, Eta
+from stand.estimating.eta import Eta
 from stand.estimating.run_estimate import Night
 from stand.imaging.equilibrium import LOST, REACHED
 from stand.watching.moment import AIR, CAMERA, SET_POINT, Moment, held_by
@@ -52,7 +52,7 @@ class Follow:
         self._reasons: set[str] = set()
         self._directory, self._session = directory, ""
         self._begin_ns: int | None = None
-        self._doing, self._goes_on = "", False
+        self._doing = ""
         self._soaks_since_ns: int | None = None  # a camera that was off
         self._utc = UtcOffsets()  # as it is now
         self._next_ns = 0
@@ -73,7 +73,7 @@ class Follow:
                 self._readings(item)
             case StepMark():
                 self.eta.mark(item)
-                self._doing, self._goes_on = mark_in_words(item.kind, item.parameters), False
+                self._doing = mark_in_words(item.kind, item.parameters)
                 self._moment = replace(self._moment, step=item.index + 1, steps=self.eta.count)
                 self._begin_ns = item.time_ns if self._begin_ns is None else self._begin_ns
                 self._next_ns = item.time_ns
@@ -88,10 +88,9 @@ class Follow:
         if name := event.data.get("session") if event.kind in ("run.start", "run.resume") else "":
             self._session = str(self._directory / str(name))
         if event.kind == "to_ambient":
-            self._doing, self._goes_on, self._soaks_since_ns = "back to the laboratory's temperature", False, None
+            self._doing, self._soaks_since_ns = "back to the laboratory's temperature", None
         if event.kind in (LOST, REACHED):
             self._soaks_since_ns = event.time_ns if event.kind == LOST else None
-        self._goes_on |= event.kind == SOAK_LONGER
         if event.kind in ("held", "released"):
             reason = str(event.data.get("reason"))
             (self._reasons.add if event.kind == "held" else self._reasons.discard)(reason)
@@ -118,7 +117,7 @@ class Follow:
         again_s = None if self._soaks_since_ns is None else (now_ns - self._soaks_since_ns) / NS_PER_S
         moment = replace(
             self._moment,
-            doing=doing_in_words(self._doing, again_s, goes_on=self._goes_on),
+            doing=doing_in_words(self._doing, again_s, goes_on=self.eta.goes_on),
             now_ns=self._utc.utc_ns(now_ns),
             share=gone_s / max(gone_s + left_s, 1e-9),
             end_ns=self._utc.utc_ns(now_ns + seconds_ns(left_s)),

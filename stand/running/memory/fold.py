@@ -64,7 +64,7 @@ def after(state: RunState, entry: Entry) -> RunState:
         case Dwell(_, step_id, earned_s, ended):
             if step_id in state.skipped:
                 return state
-            soaked = {**_begun_anew(state, {step_id}), **({step_id: ended} if ended else {})}
+            soaked = {**_forget_ends(state, {step_id}), **({step_id: ended} if ended else {})}
             earned_ns = _with(state.earned_ns, step_id, seconds_ns(earned_s))
             return replace(state, earned_ns=earned_ns, soaked=MappingProxyType(soaked))
         case Taken():
@@ -154,7 +154,7 @@ def _changed(state: RunState, change: Change) -> RunState:
             return _placed(state)
         case Extended(_, step_id, by_s):
             plan = tuple(_longer(each, step_id, by_s) for each in state.plan)
-            return replace(state, plan=plan, soaked=_begun_anew(state, {step_id}))
+            return replace(state, plan=plan, soaked=_forget_ends(state, {step_id}))
         case Edited(_, first, by):
             made = (step_of(str(each.get("kind")), _mapping(each.get("parameters"))) for each in by)
             return _placed(replace(state, plan=(*state.plan[:first], *number_steps(made, first))))
@@ -274,7 +274,7 @@ def _again(state: RunState, entry: Again) -> RunState:
         begun=state.begun.minus(ids),
         skipped=state.skipped.minus(ids),
         frames=frames,
-        soaked=_begun_anew(state, ids),
+        soaked=_forget_ends(state, ids),
         taken_again=MappingProxyType({**counts, **lossy}) if lossy else counts,
     )
     if ids != frozenset((state.under_way,)):
@@ -282,8 +282,8 @@ def _again(state: RunState, entry: Again) -> RunState:
     return _placed(kept)
 
 
-def _begun_anew(state: RunState, step_ids: Collection[str]) -> Mapping[str, str]:
-    """How soaks have ended, without these, which have not."""
+def _forget_ends(state: RunState, step_ids: Collection[str]) -> Mapping[str, str]:
+    """How soaks have ended, but for these: they go on, or are soaked again."""
     return MappingProxyType({each: ended for each, ended in state.soaked.items() if each not in step_ids})
 
 
