@@ -1,6 +1,8 @@
 """Guaranteed soaks: one ends when its time is over and the chamber was in its band at last; else it goes on, and at its
 longest the frames after it are marked, or the run is held. Over every wire, in virtual time."""
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,11 +10,13 @@ import pytest
 
 from compensation.observations import observe
 from foundation.hub import Hub
-from foundation.items import Event, StepMark, StepState
+from foundation.items import Event, Item, StepMark, StepState
 from foundation.readings import UNSETTLED
 from recording.reading.session import Session
+from stand.estimating.eta import SOAK_LONGER
 from stand.running.order import Order
-from stand.running.run import run_virtual
+from stand.running.resume import interruption
+from stand.running.run import Interrupted, resume, run_virtual
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 from tests.system.test_step_faults import Operator, run_with
 
@@ -101,6 +105,22 @@ async def test_after_its_longest_the_frames_are_marked_and_a_fit_leaves_them_out
     assert [event.level for event in events_of(session, "soak_unsettled")] == ["warning"]
     assert [meta.flags for _, meta in session.frame_metas] == [(), (UNSETTLED,)]
     assert observe(path).left_out == {"the chamber was not in its band when the soak before it ended": 1}
+
+
+async def test_a_run_that_is_interrupted_while_a_soak_goes_on_ends_it_in_the_band_all_the_same(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    def stop(item: Item) -> None:
+        if isinstance(item, Event) and item.kind == SOAK_LONGER:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        await run_virtual(order(RECIPE % "330"), tmp_path / "out", None, lambda hub: hub.subscribe(stop))
+    (directory,) = (tmp_path / "out").iterdir()
+    session = Session.open(await resume(interruption(directory), unwatched))
+    _, end_ns = last_soak_ns(session)
+    assert off_K(session, end_ns - 110_000_000_000, end_ns) <= BAND_K
+    assert [meta.flags for _, meta in session.frame_metas] == [(), ()]
 
 
 async def test_a_soak_that_may_not_end_unsettled_holds_the_run_and_begins_anew_when_cleared(
