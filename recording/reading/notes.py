@@ -24,7 +24,7 @@ from recording.reading.journal_lines import journal_line, lines_of
 NOTES_NAME = "notes.jsonl"
 LONGEST_NOTE = 4000  # characters
 LIMIT_BYTES = 4_000_000
-_TAG = re.compile(r"[^\W_][\w.:+-]{0,39}")
+TAG = re.compile(r"[^\W_][\w.:+-]{0,39}")
 _APPENDING = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _NOTE, _TAGS, _UNTAG, _ARCHIVED = "note", "tags", "untag", "archived"
 
@@ -98,7 +98,7 @@ def add_archived(directory: Path, copy: Archived, by: str) -> None:
 
 def check_tag(tag: str) -> str:
     """The tag; ConfigError when it is none."""
-    if _TAG.fullmatch(tag) is None:
+    if TAG.fullmatch(tag) is None:
         raise ConfigError(
             f"{tag!r}: a tag is one word of at most 40 letters, digits and . : + - _, and begins with a letter or digit"
         )
@@ -168,4 +168,4 @@ def _folded(entries: Iterable[dict[str, object]]) -> Notes:
 def _tags(entry: dict[str, object]) -> list[str]:
     found = entry.get("tags")
     texts = cast("list[object]", found) if isinstance(found, list) else []
-    return [tag for tag in texts if isinstance(tag, str) and _TAG.fullmatch(tag)]
+    return [tag for tag in texts if isinstance(tag, str) and TAG.fullmatch(tag)]

@@ -303,9 +303,9 @@ def _said(who: Who, note: str, tags: Sequence[str]) -> Said | None:
 
 
 def _installed(name: str) -> str:
-    """The text of an installed recipe; ConfigError lists what there is."""
+    """The text of an installed recipe; Missing lists what there is."""
     root = Path(str(importlib.resources.files("configs"))) / "recipes"
     known = {path.stem: path for path in root.glob("*.yaml")}
     if name not in known:
-        raise ConfigError(f"no recipe of that name is installed; there are {', '.join(sorted(known))}")
+        raise Missing(f"no recipe of that name is installed; there are {', '.join(sorted(known))}")
     return known[name].read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 from foundation.errors import ConfigError, Refused, Unreachable
 from stand.assembly import Assembly
-from stand.serving.desk import Conflict, FaultRequest, SimulatedFaults
+from stand.serving.desk import Conflict, FaultRequest, Missing, SimulatedFaults
 from stand.simulator import ControlSocket
 
 _ANSWERS_S = 5.0
@@ -21,17 +21,19 @@ async def simulated_faults(assembly: Assembly) -> SimulatedFaults:
 
 
 async def break_or_mend(assembly: Assembly, request: FaultRequest) -> str:
-    """What came of it, as a sentence. ConfigError when there is no such fault, or the laboratory cannot have it; else
-    as `simulated_faults`."""
+    """What came of it, as a sentence. Missing when there is no such fault, ConfigError when the laboratory cannot have
+    it; else as `simulated_faults`."""
     name, value = request.name, request.value
     async with _simulator(assembly) as simulator:
         try:
+            known = SimulatedFaults.model_validate(await simulator.request({"do": "faults"})).faults
+            if name not in {each.name for each in known}:
+                raise Missing(f"there is no fault {name!r}; GET /api/v1/simulator/faults has those there are")
             if request.mend:
                 await simulator.request({"do": "mend", "name": name})
                 return f"{name} is mended"
             if value is None:
-                known = SimulatedFaults.model_validate(await simulator.request({"do": "faults"})).faults
-                value = next((each.worst for each in known if each.name == name), None)
+                value = next(each.worst for each in known if each.name == name)
             await simulator.request({"do": "break", "name": name, "value": value, "for_s": request.for_s})
         except Refused as error:
             raise ConfigError(error.text) from error

@@ -9,14 +9,14 @@ published OpenAPI document describes, and an instant in them is ns since the epo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from foundation.documents import Document
 from foundation.errors import StandError
 from foundation.readings import Cause, Quality
-from recording.reading.notes import LONGEST_NOTE
+from recording.reading.notes import LONGEST_NOTE, TAG
 from stand.serving.not_confirmed import NotConfirmed
 from stand.serving.plan_faults import PlanCheck
 
@@ -245,17 +245,25 @@ class WrittenStep(Value):
     parameters: dict[str, JsonValue] = Field(default_factory=dict)
 
 
+# Checked, with a sentence, where it is kept.
+Tag = Annotated[str, Field(max_length=100, json_schema_extra={"pattern": f"^{TAG.pattern}$"})]
+_NAMED: dict[str, Any] = {"properties": {"recipe": {"minLength": 1}}, "required": ["recipe"]}
+_WRITTEN: dict[str, Any] = {"properties": {"recipe_text": {"minLength": 1}}, "required": ["recipe_text"]}
+
+
 class RunRequest(Document):
-    """A run that is asked for: the name of an installed recipe, or the text of one. Names of files are not taken: the
-    interface must not be a way to read any.
+    """A run that is asked for: the name of an installed recipe, or the text of one, as GET /api/v1/recipes/schema has
+    it. Names of files are not taken: the interface must not be a way to read any.
 
     attended: somebody is there to do what the plan prompts for. tags, note: for the catalogue of sessions.
     """
 
+    model_config = ConfigDict(json_schema_extra={"oneOf": [_NAMED, _WRITTEN]})
+
     recipe: str = Field(default="", max_length=200)
     recipe_text: str = Field(default="", max_length=1 << 18)
-    attended: bool = False
-    tags: tuple[str, ...] = Field(default=(), max_length=32)
+    attended: bool = Field(default=False, strict=True)
+    tags: tuple[Tag, ...] = Field(default=(), max_length=32)
     note: str = Field(default="", max_length=LONGEST_NOTE)
 
 
@@ -304,13 +312,13 @@ class SimulatedFaults(Value):
 
 
 class FaultRequest(Document):
-    """What is to be broken in the simulated laboratory: value, null for the worst; for_s: for so long, null until it is
-    mended. mend: it is mended instead."""
+    """What is to be broken in the simulated laboratory: value, of the kind that GET shows, null for the worst; for_s:
+    for so long, null until it is mended. mend: it is mended instead."""
 
     name: str = Field(max_length=100)
     value: JsonValue = None
     for_s: float | None = Field(default=None, gt=0, le=31_622_400)
-    mend: bool = False
+    mend: bool = Field(default=False, strict=True)
 
 
 class Desk(Protocol):

@@ -46,6 +46,10 @@ _KEPT = 8  # sessions' curves and drifts
 
 Ns = Annotated[int, Query(ge=0, le=1 << 62)]
 Points = Annotated[int, Query(ge=1, le=MOST_POINTS)]
+_JPEG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/jpeg": {}}},
+    204: {"description": "No frame was looked at yet"},
+}
 Camera = Annotated[str, Query(max_length=100)]
 
 
@@ -127,8 +131,8 @@ class PageRoom:
             points: Points = 1200,
             channels: Annotated[str, Query(max_length=_MOST_CHANNELS_TEXT)] = "",
         ) -> Response:
-            """Curves of the last week, decimated: smallest and largest value of each column. channels: with commas
-            between them; all without."""
+            """Curves of the last week, decimated: smallest and largest value of each column. to_ns is after from_ns.
+            channels: with commas between them; all without."""
             wanted = set(channels.split(",")) if channels else None
             try:
                 found = self._viewing.up_to_date().columns(from_ns, to_ns, points, wanted)
@@ -187,9 +191,9 @@ class PageRoom:
             more = {"cameras": list(viewing.previews), "skipped": viewing.skipped}
             return _json({**facts, **more, "trouble": preview.trouble or viewing.trouble})
 
-        @router.get("/api/v1/frame.jpg", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}})
+        @router.get("/api/v1/frame.jpg", response_class=Response, responses=_JPEG)
         async def picture(camera: Camera = "") -> Response:
-            """The last frame at half its size."""
+            """The last frame at half its size; 204 before there is one."""
             preview = _preview(viewing, camera)
             if preview is None:
                 return Response(status_code=204)

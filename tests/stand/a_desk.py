@@ -11,7 +11,6 @@ from pydantic import JsonValue
 
 from experiments.steps import Soak, number_steps
 from foundation.clock import WallClock
-from foundation.errors import ConfigError
 from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
@@ -188,7 +187,7 @@ class ADesk:
 
     async def break_(self, who: Who, request: FaultRequest) -> Done:
         if request.name not in {each.name for each in KNOWN_FAULTS}:
-            raise ConfigError(f"there is no fault {request.name}")
+            raise Missing(f"there is no fault {request.name}")
         if request.mend:
             self.standing.pop(request.name, None)
         else:

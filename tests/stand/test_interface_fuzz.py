@@ -1,4 +1,5 @@
-"""Whatever is asked by the published OpenAPI document, and against it: no answer is a 500, and each is a sentence."""
+"""Whatever is asked by the published OpenAPI document, and against it: no answer is a 500, each is a sentence and of a
+status that the document has, and what fits the document is not called wrong."""
 
 import asyncio
 import http.client
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from stand.serving.api.doors import Interface
 from tests.stand.a_desk import ADesk, served
-from tests.stand.test_interface_access import free_port
+from tests.stand.test_interface_access import ask, free_port
 
 _QUICK, _LONG = 8, 400  # examples of each operation
 _REFUSED_UNREAD = 400
@@ -77,7 +78,10 @@ def fuzz(port: int, examples: int) -> tuple[list[str], Counter[int]]:
             prepared = _prepared(request)
             status, text = answered(port, *prepared)
             seen[status] += 1
-            if status >= 500 or (status >= 400 and "error" not in json.loads(text)):
+            is_valid = case.meta is not None and case.meta.generation.mode is schemathesis.GenerationMode.POSITIVE
+            is_documented = str(status) in document["paths"][case.path][case.method.lower()]["responses"]
+            is_wrong = (is_valid and status in (400, 422)) or not is_documented
+            if is_wrong or status >= 500 or (status >= 400 and "error" not in json.loads(text)):
                 wrong.append(f"{prepared}: {status} {text[:300]!r}")
 
         ask()
@@ -109,6 +113,16 @@ async def test_no_request_by_the_document_or_against_it_makes_a_500(tmp_path: Pa
     assert wrong == []
     assert desk.orders
     assert min(seen[200], seen[404], seen[422]) > 10, seen
+
+
+async def test_a_method_that_is_not_done_at_an_address_is_answered_with_those_that_are(tmp_path: Path):
+    port = free_port()
+    async with served(ADesk(), tmp_path / "night", Interface(tmp_path, port=port)):
+        document = json.loads((await asyncio.to_thread(ask, port, "GET", "/openapi.json"))[2])
+        for path, entry in document["paths"].items():
+            status, headers, _ = await asyncio.to_thread(ask, port, "OPTIONS", path.replace("{run}", "1"))
+            methods = {method.upper() for method in entry} | ({"HEAD"} if "get" in entry else set())
+            assert (status, set(headers["allow"].split(", "))) == (405, methods), path
 
 
 async def test_what_fails_is_answered_with_a_sentence_published_as_an_event_and_hurts_nobody(tmp_path: Path):

@@ -9,6 +9,7 @@ from typing import Any, cast
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from foundation.document_faults import path_text
 from foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
@@ -87,11 +88,23 @@ def _answer_with(status: int) -> Callable[[Request, Exception], Response]:
     return lambda _, error: _error(status, str(error))
 
 
-def _refused(_: Request, error: Exception) -> Response:
+def _refused(request: Request, error: Exception) -> Response:
     refused = cast("HTTPException", error)
     more = {404: "there is no such address; /openapi.json has those there are", 405: "this is not done at this address"}
     text = more.get(refused.status_code, str(refused.detail))
-    return _error(refused.status_code, text, refused.headers)
+    headers = {"Allow": ", ".join(_allowed(request))} if refused.status_code == 405 else refused.headers
+    return _error(refused.status_code, text, headers)
+
+
+def _allowed(request: Request) -> list[str]:
+    """What is done at this address, by any of its routes; HEAD is answered where GET is."""
+    scope = {"type": "http", "path": request.scope["path"], "root_path": "", "headers": []}
+
+    def is_done(method: str) -> bool:
+        return any(route.matches({**scope, "method": method})[0] is Match.FULL for route in request.app.routes)
+
+    found = {method for method in ("DELETE", "GET", "PATCH", "POST", "PUT") if is_done(method)}
+    return sorted(found | ({"HEAD"} if "GET" in found else set()))
 
 
 def _failed(_: Request, error: Exception) -> Response:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Path, Request, Response
-from pydantic import Field, JsonValue
+from pydantic import ConfigDict, Field, JsonValue
 
 from foundation.documents import Document
 from recording.reading.notes import LONGEST_NOTE
@@ -18,6 +18,7 @@ from stand.serving.desk import (
     QueuedRun,
     RunRequest,
     SimulatedFaults,
+    Tag,
     When,
     Who,
     WrittenStep,
@@ -61,14 +62,23 @@ class MoveRequest(Document):
 
 
 class NoteRequest(Document):
-    """A sentence about a session, and tags to find it by."""
+    """A sentence about a session, tags to find it by, or both."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [
+                {"properties": {"text": {"pattern": r"\S"}}, "required": ["text"]},
+                {"properties": {"tags": {"minItems": 1}}, "required": ["tags"]},
+            ]
+        }
+    )
 
     text: str = Field(default="", max_length=LONGEST_NOTE)
-    tags: tuple[Annotated[str, Field(max_length=100)], ...] = Field(default=(), max_length=32)
+    tags: tuple[Tag, ...] = Field(default=(), max_length=32)
 
 
 class DeviceRequest(Document):
-    """What a verb of a device is given, by name."""
+    """What a verb of a device is given, by name: GET /api/v1/devices has the arguments that each takes."""
 
     arguments: dict[str, JsonValue] = Field(default_factory=dict)
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response, WebSocket
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.websockets import WebSocketDisconnect
 
 from experiments.steps import schema_of_steps
@@ -40,7 +40,7 @@ class Health(BaseModel):
 class LoginRequest(Document):
     """read_only: for somebody who may only look and press STOP."""
 
-    read_only: bool = False
+    read_only: bool = Field(default=False, strict=True)
 
 
 class Invitation(BaseModel):
