@@ -23,7 +23,7 @@ from stand.commands.reached import ConfigOption, DirectoryArgument, TokenOption,
 from stand.commands.sessions.session_text import size
 from stand.gate import INTERLOCK, STOPPING
 from stand.serving.client import API, Answer, Server
-from stand.serving.desk import RunStatus, StandState
+from stand.serving.desk import FaultState, RunStatus, StandState
 from stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
 from stand.watching.remedies import for_reason, next_command
 
@@ -31,6 +31,7 @@ app = App()
 
 StepArgument = Annotated[str, typer.Argument(metavar="STEP", help="Its number in `stand status --plan`, or its id.")]
 _WATCH_S = 2.0
+_AGAIN_S, _LOOK_S = 2.0, 0.25  # the guard looks once a second
 _LABEL = 14
 
 
@@ -131,7 +132,12 @@ def clear(
             raise
         return
     answer = server.order("clear")
-    _say(server, answer, f"cleared; {_still(answer) if answer.get('reasons') else 'nothing holds the stand any more'}")
+    again, text = _held_again(server), str(answer.get("text") or "cleared")
+    if again is not None:
+        text = f"cleared; held again: {again.rule}: {again.text}"
+        _say(server, {**answer, "text": text, "reasons": [INTERLOCK]}, f"{text}; {for_reason(INTERLOCK)}")
+    else:
+        _say(server, answer, f"{text}; {_still(answer)}" if answer.get("reasons") else text)
 
 
 @app.command()
@@ -172,6 +178,15 @@ def stop(server: Server) -> None:
     """
     answer = server.order("stop")
     _say(server, answer, str(answer["text"]))
+
+
+def _held_again(server: Server) -> FaultState | None:
+    """What the guard, or a step that is done again, has met within a moment of a clear."""
+    for _ in range(round(_AGAIN_S / _LOOK_S)):
+        if (fault := server.state().fault) is not None:
+            return fault
+        threading.Event().wait(_LOOK_S)
+    return None
 
 
 def _cleared_here(config: str) -> bool:

@@ -102,8 +102,7 @@ class DaemonDesk:
         daemon.note()
         if daemon.open_stand.latched is None:
             daemon.clear_queue()
-        again = daemon.open_stand.latched
-        return self._done("clear", "cleared" if again is None else f"it has tripped again: {again.text}")
+        return self._done("clear", daemon.open_stand.cleared())
 
     def stop(self, who: Who) -> Done:
         """Make the stand safe and end the run, if there is one."""

@@ -25,7 +25,7 @@ Rule = Callable[[Readings, int], Fault | None]
 class Watch:
     """A rule, how long it must object without a break before it counts (s), and what is then done.
 
-    after_gap_s: for so long after a look that came late its objection does not count, because it judges by how old
+    objection: the rule's at the last check, within its grace time, too. after_gap_s: for so long after a look that came late its objection does not count, because it judges by how old
     something is that could not be renewed meanwhile. Permits wait for fresh readings all that time.
     """
 
@@ -33,12 +33,13 @@ class Watch:
     grace_s: float = 0.0
     action: Action = "abort"
     since_ns: int | None = None
+    objection: Fault | None = None
     ends_itself: bool = False
     after_gap_s: float = 0.0
 
     def check(self, readings: Readings, now_ns: int) -> Fault | None:
         """The rule's fault once it has stood for the grace time."""
-        fault = self.rule(readings, now_ns)
+        fault = self.objection = self.rule(readings, now_ns)
         if fault is None:
             self.since_ns = None
             return None

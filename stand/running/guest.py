@@ -238,6 +238,7 @@ class Guest:
             executor,
             board.status,
             lambda: open_stand.latched,
+            open_stand.cleared,
             notes,
             board.eta,
         )

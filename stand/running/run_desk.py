@@ -58,8 +58,8 @@ _ENDING = (Phase.ABORTING, Phase.ENDING, Phase.ENDED)
 class RunDesk:
     """The desk of a run (stand/serving/desk.py has what each method does). A subscriber of the hub.
 
-    session: its folder. status: the published state of the run. latched: why the guard holds the stand. notes: where
-    the session's file of notes is written. eta: what the steps are expected to take, the same as the run's end is from.
+    session: its folder. status: the published state of the run. latched: why the guard holds the stand. cleared: what
+    came of a clear. notes: where the session's file of notes is written. eta: what the steps are expected to take, the same as the run's end is from.
     """
 
     assembly: Assembly
@@ -69,6 +69,7 @@ class RunDesk:
     executor: Executor
     status: Callable[[], RunStatus]
     latched: Callable[[], Fault | None]
+    cleared: Callable[[], str]
     notes: DiskCalls
     eta: Eta
 
@@ -148,7 +149,7 @@ class RunDesk:
         if INTERLOCK not in self.assembly.stand.gate.reasons:
             raise Conflict("there is nothing to clear: no interlock holds this run")
         self.assembly.stand.gate.clear(INTERLOCK)
-        return self._done(who, "clear", {}, "cleared")
+        return self._done(who, "clear", {}, self.cleared())
 
     def stop(self, who: Who) -> Done:
         """At once, and then say who did it."""

@@ -22,7 +22,7 @@ from tests.system.test_guard_wire import Start, bench_of
 def desk_of(assembly: Assembly) -> RunDesk:
     """Of a run of which only the stand is asked."""
     log, nothing = Logbook(assembly.hub, assembly.clock, fold((), ())), cast("Any", None)
-    return RunDesk(assembly, Path("session"), Stop(), log, nothing, nothing, nothing, nothing, nothing)
+    return RunDesk(assembly, Path("session"), Stop(), log, nothing, nothing, nothing, nothing, nothing, nothing)
 
 
 def paused(desk: RunDesk) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -98,6 +98,11 @@ class OpenStand:
         """What the guard has made the stand safe for, and nobody has cleared."""
         return None if self._guard is None else self._guard.held
 
+    def cleared(self) -> str:
+        """What an operator is told who has cleared the stand."""
+        still = "" if self._guard is None else self._guard.still_wrong()
+        return f"cleared; {still}" if still else "cleared; nothing is wrong any more"
+
     def is_well(self) -> bool:
         """Whether the guard looks as often as it must, and finds nothing."""
         return self._guard is not None and self._guard.is_on_time and self._guard.held is None
