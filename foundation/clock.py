@@ -254,6 +254,12 @@ class VirtualClock:
                 return
 
 
+def call_pause_s(clock: Now, pause_s: float) -> float:
+    """Real seconds to keep between two calls of a device that wants `pause_s`. In virtual time a call takes none, so
+    none pass between the calls of one instant, and those of two instants are apart on the clock."""
+    return 0.0 if isinstance(clock, VirtualClock) else pause_s
+
+
 def block_until(clock: Now, time_ns: int) -> None:
     """Keep the calling thread until `time_ns`, which is some ms ahead, to a tenth of a ms; for lanes. ValueError in
     virtual time, which would never get there."""

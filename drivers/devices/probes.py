@@ -23,7 +23,7 @@ from drivers.wires.line_client import LineClient
 from drivers.wires.link import SerialSettings
 from foundation.addresses import ByteAddress
 from foundation.calls import Lane
-from foundation.clock import Clock
+from foundation.clock import Clock, call_pause_s
 from foundation.errors import Refused, Unreachable
 from foundation.readings import Reading, bad_reading
 
@@ -96,7 +96,7 @@ class Probe:
         line = SerialSettings(
             settings.baud or as_delivered.baud, as_delivered.stopbits, as_delivered.parity, as_delivered.databits
         )
-        self._client = LineClient.at(name, settings.address, line, (settings.timeout_s, _GAP_S))
+        self._client = LineClient.at(name, settings.address, line, (settings.timeout_s, call_pause_s(clock, _GAP_S)))
 
     async def open(self) -> None:
         """Which unit answers; Refused when it is another one."""

@@ -16,7 +16,7 @@ from typing import TypeVar
 from drivers.wires.modbus_client import BusSettings, FaultKind, ModbusClient, WireFault
 from drivers.wires.registers import Space
 from foundation.calls import Lane
-from foundation.clock import Clock, seconds_ns
+from foundation.clock import Clock, call_pause_s, seconds_ns
 from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 __all__ = ["Bus", "BusCounters", "BusSettings"]
@@ -93,7 +93,7 @@ class Bus:
         self.counters = BusCounters()
         self.clock = clock
         self._client = ModbusClient(settings)
-        self._gap_s = settings.gap_s if self._client.serial else 0.0
+        self._gap_s = call_pause_s(clock, settings.gap_s) if self._client.serial else 0.0
         self._quarantine_s = settings.timeout_s + QUARANTINE_MARGIN_S
         self._lane: Lane | None = None
         self._health: dict[int, _Health] = {}

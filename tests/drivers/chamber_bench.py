@@ -20,7 +20,7 @@ from drivers.sim.units.julabo_circulator import FakeJulabo
 from drivers.sim.units.simserv_chamber import FakeSimserv
 from drivers.sim.wire import PtyWire, TcpWire
 from drivers.wires.line_client import LineClient
-from foundation.clock import FollowedClock, WallClock, seconds_ns
+from foundation.clock import Clock, FollowedClock, WallClock, seconds_ns
 from foundation.readings import Reading
 
 LIMIT_S = 60.0  # of what comes at once; a test that fails is not to hang
@@ -81,7 +81,7 @@ class Held(LinkFaults):
 class Bench:
     """A chamber of one make on its wire, the plant behind it, and its driver."""
 
-    def __init__(self, make: str, wire: str, folder: Path, **settings: object) -> None:
+    def __init__(self, make: str, wire: str, folder: Path, clock: Clock | None = None, /, **settings: object) -> None:
         self.plant = Plant(PlantSpec(laboratory_swing_K=0.0), START_NS)
         self.clock = FollowedClock(START_NS)
         self.faults = Held(seed=5)
@@ -100,7 +100,7 @@ class Bench:
         if make == "simserv":
             known["off_channels"] = [2]
         self.driver = ClimateChamber(
-            "regulator", SETTINGS.validate_python({**known, **settings}), ALLOWED_DEGC, WallClock()
+            "regulator", SETTINGS.validate_python({**known, **settings}), ALLOWED_DEGC, clock or WallClock()
         )
 
     def _fake(self, make: str, wire: str) -> FakeClimateChamber:
@@ -124,8 +124,10 @@ class Bench:
 
 
 @asynccontextmanager
-async def bench_of(make: str, wire: str, folder: Path, **settings: object) -> AsyncGenerator[Any]:
-    bench = Bench(make, wire, folder, **settings)
+async def bench_of(
+    make: str, wire: str, folder: Path, clock: Clock | None = None, /, **settings: object
+) -> AsyncGenerator[Any]:
+    bench = Bench(make, wire, folder, clock, **settings)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(LineClient, "_quarantine", bench.faults.noticed(vars(LineClient)["_quarantine"]))
         try:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from drivers.devices.chambers.chamber_simserv import reply_of
+from foundation.clock import VirtualClock, WallClock
 from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused
 from tests.drivers.chamber_bench import MAKES, ON_WIRES, bench_of, running_at_30_degC
 
@@ -295,3 +296,16 @@ async def test_a_reply_of_another_address_is_discarded(tmp_path: Path):
             await bench.driver.read()
         bench.fake.answers_as = 1
         assert (await bench.read())["pv"].value == pytest.approx(24.0, abs=2)
+
+
+async def test_the_pause_between_two_requests_costs_no_real_time_in_virtual_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    paused: list[float] = []
+    monkeypatch.setattr("drivers.wires.line_client.time.sleep", paused.append)
+    for clock, is_paused in ((WallClock(), True), (VirtualClock(0), False)):
+        async with bench_of("espec", "tcp", tmp_path, clock, gap_s=5.0) as bench:
+            await bench.driver.open()
+            await bench.read()
+        assert bool(paused) is is_paused
+        paused.clear()

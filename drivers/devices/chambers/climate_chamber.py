@@ -16,7 +16,7 @@ from drivers.devices.exclusive import Exclusive
 from drivers.devices.in_force import InForce
 from drivers.settings import Identity, same_device
 from foundation.calls import Lane, Result
-from foundation.clock import Clock, seconds_ns
+from foundation.clock import Clock, call_pause_s, seconds_ns
 from foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
 from foundation.readings import Reading
 
@@ -47,7 +47,8 @@ class ClimateChamber:
         self._clock = clock
         protocol = settings.model_dump()["protocol"]
         module = cast("_Module", importlib.import_module(f"drivers.devices.chambers.chamber_{protocol}"))
-        self._language = module.Language(name, settings)
+        gap_s = call_pause_s(clock, settings.gap_s)
+        self._language = module.Language(name, settings.model_copy(update={"gap_s": gap_s}))
         self.dead_man = self._language.dead_man
         self._lane: Lane | None = None
         self._exclusive = Exclusive()
