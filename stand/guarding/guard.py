@@ -114,16 +114,16 @@ class Guard:
         return fault
 
     def still_wrong(self) -> str:
-        """For who has just cleared: what holds the stand again, or will once its grace time is over; "" when no rule
-        objects to anything."""
+        """For who has just cleared: what holds the stand again, or will once it has lasted for its grace time; "" when
+        no rule objects to anything."""
         if self.held is not None:
             return f"held again: {self.held.text}"
-        graced = [
-            f"{watch.objection.text}, which holds the stand again unless it ends within {watch.grace_s:g} s"
+        lasting = [
+            f"{watch.objection.text}, which counts again once it has lasted for {watch.grace_s:g} s"
             for watch in self.watches
             if watch.objection is not None and watch.action != "warn"
         ]
-        return "; ".join(graced)
+        return "; ".join(lasting)
 
     def recording_ended(self) -> None:
         """Nothing is recorded from now on. A hold for what was not on the disk in time ends with that, and its cause

@@ -25,8 +25,9 @@ Rule = Callable[[Readings, int], Fault | None]
 class Watch:
     """A rule, how long it must object without a break before it counts (s), and what is then done.
 
-    objection: the rule's at the last check, within its grace time, too. after_gap_s: for so long after a look that came late its objection does not count, because it judges by how old
-    something is that could not be renewed meanwhile. Permits wait for fresh readings all that time.
+    objection: the rule's at the last check, within its grace time, too. after_gap_s: for so long after a look that came
+    late its objection does not count, because it judges by how old something is that could not be renewed meanwhile.
+    Permits wait for fresh readings all that time.
     """
 
     rule: Rule

@@ -59,7 +59,8 @@ class RunDesk:
     """The desk of a run (stand/serving/desk.py has what each method does). A subscriber of the hub.
 
     session: its folder. status: the published state of the run. latched: why the guard holds the stand. cleared: what
-    came of a clear. notes: where the session's file of notes is written. eta: what the steps are expected to take, the same as the run's end is from.
+    came of a clear. notes: where the session's file of notes is written. eta: what the steps are expected to take, the
+    same as the run's end is from.
     """
 
     assembly: Assembly

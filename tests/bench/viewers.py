@@ -91,7 +91,7 @@ async def _stops(config: StandConfig, session: Path) -> tuple[_Times, _Times]:
     async with abort.polled(config) as (assembly, control):
         nothing = cast("Any", None)
         log = Logbook(assembly.hub, assembly.clock, fold((), ()))
-        desk = _Desk(assembly, session, Stop(), log, nothing, nothing, nothing, nothing, nothing)
+        desk = _Desk(assembly, session, Stop(), log, nothing, nothing, nothing, nothing, nothing, nothing)
 
         async def by_command(stand: Stand, _: Assembly) -> float:
             begun_s = math.nan

@@ -26,6 +26,7 @@ from stand.serving.desk import (
     DeviceState,
     Done,
     FaultRequest,
+    FaultState,
     HeatByHand,
     KnownFault,
     Missing,
@@ -62,6 +63,7 @@ class ADesk:
             self.gate.hold(reason)
         self.run = run
         self.by_hand: HeatByHand | None = None
+        self.fault: FaultState | None = None
         self.not_confirmed: tuple[NotConfirmed, ...] = ()
         self.moving: tuple[str, ...] = ()
         self.orders: list[tuple[Who, Verb, dict[str, JsonValue]]] = []
@@ -93,6 +95,7 @@ class ADesk:
             run=self.run,
             reasons=tuple(sorted(self.gate.reasons)),
             by_hand=self.by_hand,
+            fault=self.fault,
             not_confirmed=self.not_confirmed,
             readings={
                 name: ReadingState(

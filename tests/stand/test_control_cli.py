@@ -21,7 +21,7 @@ from stand.running.memory.state import RunState
 from stand.running.opening.stop import Stop
 from stand.running.status import StatusBoard
 from stand.serving.api.access import user_name
-from stand.serving.desk import RunStatus
+from stand.serving.desk import FaultState, RunStatus
 from stand.serving.not_confirmed import NotConfirmed
 from tests.asking import ask
 from tests.host import Host
@@ -141,6 +141,10 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         nothing = await invoke("clear", tmp_path)
         assert nothing.exit_code == 1
         assert "nothing to clear" in nothing.stderr
+        desk.gate.hold("interlock")
+        desk.fault = FaultState(rule="stage_alarm", text="the stage is in alarm", since_ns=0)
+        again = await invoke("clear", tmp_path)
+        assert "held again: stage_alarm: the stage is in alarm" in again.stdout
         assert "when the step under way is done" in (await invoke("pause", tmp_path, "--at-next-step")).stdout
         assert (await invoke("skip", "1", tmp_path)).stdout == f"{path}: step 1 is left out\n"
         assert (await invoke("extend", "0-soak", "30", tmp_path)).stdout == f"{path}: step 0-soak takes 30 min longer\n"
@@ -150,6 +154,7 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
     assert orders == [
         ("pause", {"when": "now"}),
         ("continue", {}),
+        ("clear", {}),
         ("clear", {}),
         ("pause", {"when": "step"}),
         ("skip", {"step_id": "0-soak"}),

@@ -53,6 +53,7 @@ async def test_what_is_still_wrong_when_it_is_cleared_holds_before_anything_can_
     await bench.run_for(2)
     bench.guard.clear()
     assert bench.guard.held == Fault("rule0", "it is so", "hold")
+    assert "it is so" in bench.guard.still_wrong()
     assert bench.log == ["hold rule0", "revoke", "safe", "hold rule0", "revoke"]
     await bench.run_for(2)
     assert bench.log[5:] == ["safe"]
@@ -253,10 +254,15 @@ async def test_clearing_restarts_the_grace_time_of_every_rule():
     bench.objecting = {0}
     await bench.run_for(8)
     assert bench.guard.clear() is None
+    assert "it is so" in bench.guard.still_wrong()
     await bench.run_for(8)
     assert bench.guard.held is None
     await bench.run_for(4)
     assert bench.guard.held is not None
+    bench.objecting = set()
+    bench.guard.clear()
+    await bench.run_for(1)
+    assert bench.guard.still_wrong() == ""
 
 
 async def test_a_fault_that_aborts_does_so_during_a_hold():

@@ -216,7 +216,9 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
         trip = await watcher.event(f"guard.{rule}", 3000)
         assert trip.level == "error"
         if rule == "stage_alarm":  # cleared without a look at the cause
-            assert (await asyncio.to_thread(ask, directory, "clear"))["reasons"] == ["interlock"]
+            cleared = await asyncio.to_thread(ask, directory, "clear")
+            assert cleared["reasons"] == ["interlock"]
+            assert trip.text in str(cleared["text"])
             await watcher.event("guard.stage_alarm", 60)
         if mends:
             await do(*mends)
