@@ -92,6 +92,13 @@ class Permits:
         """So long after the last renewal the board itself switches heat and cold off; None without a board."""
         return self._limits.hold_s if self._relays.has_timer else None
 
+    @property
+    def ended_ns(self) -> int | None:
+        """When the board's own timer ended heat that is permitted, because it was not renewed; None while it lasts."""
+        until_ns = self._until_ns.get(HEATER)
+        is_over = until_ns is not None and until_ns <= self._clock.now_ns()
+        return until_ns if is_over and self.granted and self._relays.has_timer else None
+
     def grant(self) -> None:
         """Permit heat and cold; `arm` switches."""
         self.permission, self.intrusions = Permission.GRANTED, 0

@@ -14,6 +14,7 @@ from typing import Annotated, cast
 
 import typer
 
+from foundation.clock import NS_PER_S
 from foundation.command_app import App
 from foundation.errors import ConfigError, SessionError
 from foundation.instants import duration, local_text
@@ -33,6 +34,7 @@ StepArgument = Annotated[str, typer.Argument(metavar="STEP", help="Its number in
 _WATCH_S = 2.0
 _AGAIN_S, _LOOK_S = 2.0, 0.25  # the guard looks once a second
 _LABEL = 14
+_NEW_NS = 10 * NS_PER_S  # slower than any installed stand polls
 
 
 @app.command()
@@ -266,6 +268,8 @@ def idle_lines(name: str, state: StandState) -> Iterator[str]:
     for channel, reading in state.readings.items():
         if reading.unit == "degC":
             known = f"no reading: {reading.reason}" if reading.value is None else f"{reading.value:.2f} degC"
+            if (age_ns := state.now_ns - reading.time_ns) > _NEW_NS:
+                known += f", {_span(age_ns)} ago"
             is_idle = channel == SET_POINT and state.setpoint_degC is None and reading.value is not None
             yield _row("temperatures", f"{channel} {'none' if is_idle else known}")
     waiting = sum(run.state in ("waiting", "interrupted") for run in state.queue)

@@ -193,8 +193,10 @@ class DaemonDesk:
 
     def _heat_by_hand(self) -> HeatByHand | None:
         """As it was ordered: what the regulator says of it is unknown while its wire is gone."""
-        ordered = self._assembly.stand.chamber.ordered
-        return None if ordered is None else HeatByHand(**asdict(ordered))
+        chamber = self._assembly.stand.chamber
+        if chamber.ordered is None:
+            return None
+        return HeatByHand(**asdict(chamber.ordered), cut_ns=chamber.permits.ended_ns)
 
     def _of_run(
         self, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], call: Callable[[RunDesk], Result]

@@ -84,10 +84,12 @@ def moment_of(state: StandState, drift_px: float | None = None) -> Moment:
 
 def heat_by_hand(state: StandState) -> str:
     """`heated by hand to 40 °C since 2026-01-01 19:00:04 CET`; "" when nobody heats by hand."""
-    if state.by_hand is None:
+    if (hand := state.by_hand) is None:
         return ""
-    since = local_text(state.by_hand.since_ns + state.utc_offset_ns)
-    return f"heated by hand to {state.by_hand.setpoint_degC:g} °C since {since}"
+    text = f"heated by hand to {hand.setpoint_degC:g} °C since {local_text(hand.since_ns + state.utc_offset_ns)}"
+    if hand.cut_ns is None:
+        return text
+    return f"{text}; heat cut by the relay board's timer at {local_text(hand.cut_ns + state.utc_offset_ns)}"
 
 
 def not_yet_safe(state: StandState) -> Iterable[str]:

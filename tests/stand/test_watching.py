@@ -207,6 +207,11 @@ def test_a_stand_that_a_daemon_has_is_shown_alike():
     since = "heated by hand to 40 °C since 2026-01-01 18:00:00 UTC"
     assert moment_of(heated).doing == f"no run; {since}"
     assert f"state         {since}" in idle_lines("out", heated)
+    hand = by_hand.model_copy(update={"cut_ns": BEGIN_NS + 60 * NS_PER_S})
+    cut = heated.model_copy(update={"by_hand": hand, "now_ns": air.time_ns + 61 * NS_PER_S})
+    lines = list(idle_lines("out", cut))
+    assert f"state         {since}; heat cut by the relay board's timer at 2026-01-01 18:01:00 UTC" in lines
+    assert "temperatures  thermometers.air 23.98 degC, 0:01:01 ago" in lines
 
 
 def shown_shares(lines: list[str]) -> list[int]:

@@ -58,7 +58,10 @@ function show(state) {
 
 // What was ordered by hand is known also while the regulator does not answer; else what that says it does.
 function between_runs({ by_hand, setpoint_degC, utc_offset_ns }) {
-  if (by_hand) return `set to ${by_hand.setpoint_degC} °C, on since ${day_clock(seconds(by_hand.since_ns, utc_offset_ns))}`;
+  if (by_hand) {
+    const since = `set to ${by_hand.setpoint_degC} °C, on since ${day_clock(seconds(by_hand.since_ns, utc_offset_ns))}`;
+    return by_hand.cut_ns === null ? since : `${since}; heat cut by the relay board's timer at ${day_clock(seconds(by_hand.cut_ns, utc_offset_ns))}`;
+  }
   return setpoint_degC === null ? "no run" : `no run; chamber at ${setpoint_degC} °C`;
 }
 

@@ -230,7 +230,8 @@ def _run_status(seen: Seen) -> tuple[int, str]:
     if state.reasons:
         return (BUSY if state.run else WARN), f"held: {', '.join(state.reasons)}"
     if state.by_hand is not None:
-        return IDLE, f"heat by hand, set-point {state.by_hand.setpoint_degC:g} degC"
+        text = f"heat by hand, set-point {state.by_hand.setpoint_degC:g} degC"
+        return (IDLE, text) if state.by_hand.cut_ns is None else (WARN, f"{text}; cut by the relay board's timer")
     return (IDLE, "") if state.phase == "idle" else (BUSY, "a run is under way" if state.run is None else "")
 
 
