@@ -56,31 +56,28 @@ class Motions:
     """What moves at this moment (an axis, the flap), and where to: whether an operator may put a hand in."""
 
     def __init__(self) -> None:
-        self._under_way: dict[str, str] = {}
+        self._under_way: dict[object, tuple[str, str]] = {}  # by motion, in the order they began: what moves, where to
 
     @property
     def texts(self) -> list[str]:
-        """As in `["linear to 250 mm", "flap closing"]`."""
-        return [f"{name} {text}" for name, text in self._under_way.items()]
+        """As in `["linear to 250 mm", "flap closing"]`: of each the motion that began last."""
+        return [f"{name} {text}" for name, text in dict(self._under_way.values()).items()]
 
     @property
     def names(self) -> tuple[str, ...]:
         """What moves: axes, the flap."""
-        return tuple(self._under_way)
+        return tuple(dict(self._under_way.values()))
 
     def moves(self, name: str) -> bool:
         """Whether this one is under way."""
-        return name in self._under_way
+        return name in self.names
 
     @contextmanager
     def under_way(self, name: str, text: str) -> Generator[None]:
-        """It moves while inside; where one motion is part of another, the inner one is shown."""
-        before = self._under_way.get(name)
-        self._under_way[name] = text
+        """It moves while inside. A motion may be part of another, or end after one that has taken its place."""
+        motion = object()
+        self._under_way[motion] = name, text
         try:
             yield
         finally:
-            if before is None:
-                self._under_way.pop(name, None)
-            else:
-                self._under_way[name] = before
+            del self._under_way[motion]

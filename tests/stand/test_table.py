@@ -19,6 +19,18 @@ async def test_a_stage_without_its_scale_is_homed_first():
         assert (here.calls, here.stand.motions.texts) == (["linear home", "linear to 25"], [])
 
 
+async def test_an_order_to_a_stage_that_is_under_way_takes_its_place_and_nothing_is_left_moving():
+    async with rooms() as here:
+        here.linear.has_scale = False
+        first = asyncio.create_task(here.stand.table.move_to("linear", 25.0))
+        await here.passes(0.5)
+        second = asyncio.create_task(here.stand.table.move_to("linear", 30.0))
+        await here.passes(0.1)
+        assert here.stand.motions.texts == ["linear homing, then to 30 mm"]
+        await asyncio.gather(first, second)
+        assert (here.stand.motions.texts, here.stand.motions.names) == ([], ())
+
+
 async def test_a_fault_while_a_stage_homes_keeps_it_from_the_move():
     async with rooms() as here:
         here.linear.has_scale = False
