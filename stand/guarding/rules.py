@@ -196,7 +196,7 @@ def _sensors(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
 def _drifts(config: StandConfig) -> tuple[Watch, ...]:
     """The air's thermometer against others in that air: `safety` ones, and the regulator's probe, which shows 0.1 K and
     sits beside the heater, where it has one."""
-    same, limit_K = (FLAP, "relays.camera_power"), config.guard.sensors.drift_K
+    same, limit_K = (FLAP, "relays.camera_power", RUNNING), config.guard.sensors.drift_K
     others = dict.fromkeys(safety_thermometers(config), limit_K)
     if config.regulator_unit is not None:
         others[PV] = limit_K + _PV_K
