@@ -15,14 +15,20 @@ from compensation.calibration.exports import EXPORTS, refit_radtan, write_export
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.session_centres import observe_positions
 from compensation.calibration.stage_geometry import TableSigma
-from compensation.commands.options import CameraName, Incomplete, TargetOption, named_target, open_session
+from compensation.commands.options import (
+    CameraName,
+    Incomplete,
+    TargetOption,
+    finding_markers,
+    named_target,
+    open_session,
+)
 from compensation.observations import session_target
 from compensation.one_camera import serial_of
 from compensation.reporting.calibration_report import report_page
 from foundation.command_app import App
 from foundation.files import check_folder_writable, check_writable, write_whole
 from foundation.output import show
-from foundation.progress import progress
 from markers.target import Target
 from recording.reading.session import Session
 
@@ -69,7 +75,7 @@ def calibrate_session(
     opened = open_session(session, camera, incomplete)
     used = named_target(target) or session_target(opened)
     sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)
-    with progress("find markers", opened.frame_count) as shown:
+    with finding_markers(opened.frame_count) as shown:
         positions = observe_positions(opened, used, shown)
     found = calibrate(positions, used, sigma, model)
     file = _file(opened, used.name, found, keep_rays=keep_rays)

@@ -13,6 +13,7 @@ from compensation.commands.options import (
     Incomplete,
     MegapixelsOption,
     TargetOption,
+    finding_markers,
     installed_target,
     said_if,
     say_left_out,
@@ -23,7 +24,7 @@ from foundation.errors import ConfigError
 from foundation.files import check_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.output import show
-from foundation.progress import Report, late_progress
+from foundation.progress import Report
 from foundation.usage import one_line
 from markers.detection import Detection, DetectionError, Image, detect, nothing_found
 from markers.detections_table import CENTRES, DetectedImage, write_detections
@@ -58,7 +59,7 @@ def detect_images(
         chosen = _detection_target(opened, target)
         failures: list[str] = []
         doubtful: list[str] = []
-        with late_progress("find markers", sum(_count(source) for source in opened)) as report:
+        with finding_markers(sum(_count(source) for source in opened), is_quick=True) as report:
             write_detections(out, chosen, _detections(opened, chosen, failures, doubtful, report))
         shown = {"table": out, "target": chosen.name, "not_found": failures, "doubtful": doubtful}
         show(shown, [CENTRES, chosen.orientation])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ from compensation.observations import Observations, observe
 from compensation.one_camera import take
 from foundation.errors import ConfigError
 from foundation.output import say
-from foundation.progress import progress
+from foundation.progress import Report, late_progress, progress
 from markers.detections_table import doubt
 from markers.target import Target, load_target
 from recording.reading.session import Session
@@ -92,6 +93,19 @@ def named_target(name: str | None) -> Target | None:
 def said_if(incomplete: bool) -> Say | None:
     """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
     return (lambda text: say(f"warning: {text}")) if incomplete else None
+
+
+@contextmanager
+def finding_markers(count: int, *, is_quick: bool = False) -> Generator[Report]:
+    """Progress of a search in so many images; is_quick: shown only once it has taken a while. What has to be compiled
+    first is said, and no part of the time left."""
+    from markers.compile_ahead import compile_ahead  # numba takes long to load
+
+    compile_ahead(
+        lambda: say("the search for markers is compiled for this machine, which takes a moment; the result is kept")
+    )
+    with (late_progress if is_quick else progress)("find markers", count) as report:
+        yield report
 
 
 def say_left_out(what: str, failures: Sequence[str], doubtful: Sequence[str]) -> None:

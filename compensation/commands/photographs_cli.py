@@ -16,13 +16,13 @@ from compensation.calibration.model_scores import known_or_why
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.view_uncertainty import Known, known
 from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
-from compensation.commands.options import MegapixelsOption, installed_target, say_left_out
+from compensation.commands.options import MegapixelsOption, finding_markers, installed_target, say_left_out
 from foundation.command_app import App
 from foundation.errors import CalibrationError, ConfigError
 from foundation.files import check_folder_writable
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.output import show
-from foundation.progress import Report, progress
+from foundation.progress import Report
 from markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
 from markers.detection import DetectionError, Image, detect
 from markers.image_file import read_image
@@ -65,7 +65,7 @@ def calibrate_photographs(
         board = described(target)
         failures: list[str] = []
         doubtful: list[str] = []
-        with progress("find markers", len(images)) as report:
+        with finding_markers(len(images)) as report:
             seen = views_of([(path, path.name) for path in images], board, failures, doubtful, report)
         say_left_out("not used:", failures, doubtful)
         views, given = seen.part(np.asarray(seen.seen.any(axis=1))), known_board(board)

@@ -12,14 +12,14 @@ import typer
 from compensation.calibration.exports import EXPORTS, write_exports
 from compensation.calibration.pinhole import NAMES
 from compensation.calibration.rig import RigCalibration, calibrate_rig
-from compensation.commands.options import MegapixelsOption, say_left_out
+from compensation.commands.options import MegapixelsOption, finding_markers, say_left_out
 from compensation.commands.photographs_cli import described, known_board, views_of
 from foundation.command_app import App
 from foundation.errors import ConfigError
 from foundation.files import check_folder_writable, make_folder, write_whole
 from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
 from foundation.output import show
-from foundation.progress import Report, progress
+from foundation.progress import Report
 
 app = App()
 
@@ -56,7 +56,7 @@ def calibrate_rig_command(
         names = _moments(folders)
         failures: list[str] = []
         doubtful: list[str] = []
-        with progress("find markers", len(folders) * len(names)) as report:
+        with finding_markers(len(folders) * len(names)) as report:
             seen = [
                 views_of(_pictures(folder, names), board, failures, doubtful, _after(report, number * len(names)))
                 for number, folder in enumerate(folders)

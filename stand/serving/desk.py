@@ -178,8 +178,8 @@ class QueuedRun(Value):
 
 class HeatByHand(Value):
     """Heat and cold that somebody ordered between runs. setpoint_degC: as it was ordered, also while the regulator does
-    not answer; since_ns: when they were permitted; cut_ns: when the relay board's own timer ended them, because it could
-    not be reached, null while they last."""
+    not answer; since_ns: when they were permitted; cut_ns: when the relay board's own timer ended them, because it
+    could not be reached, null while they last."""
 
     setpoint_degC: float
     since_ns: int

@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 from compensation.finding.png_rows import decode_rows
 from compensation.reporting.drawing import figures
 from foundation.clock import NS_PER_S, VirtualClock
-from foundation.documents import parse_document
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
 from foundation.readings import Frame, Reading
-from markers.detection import detect
-from markers.target import Target
+from markers.compile_ahead import compile_ahead
 from recording.format.images import encode_png
 from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.addresses import WORKER
@@ -117,7 +115,7 @@ def compile_fit(lock: Path) -> None:
     with lock.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         decode_rows(encode_png(np.zeros((8, 64), np.uint8)))
-        detect(photo(GLARE[0]), parse_document(TARGET_YAML, Target, "target.yaml"))
+        compile_ahead(lambda: None)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,9 +6,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from numba.core.event import RecordingListener, install_listener
 
+from foundation.documents import parse_document
 from markers import compiled
+from markers.compile_ahead import compile_ahead
 from markers.compiled import digest
+from markers.detection import Flag, detect
+from markers.target import Target
+from recording.format.images import encode_png
+from tests.compensation.conftest import GLARE, TARGET_YAML, photo
 
 PROGRAM = """
 from markers.compiled import entry
@@ -45,3 +52,39 @@ def test_an_installation_where_nothing_can_be_written_compiles_in_every_process(
 def test_a_digest_follows_the_sources():
     assert digest(compiled) == digest(compiled)
     assert digest(compiled) != digest(compiled, pytest)
+
+
+def test_nothing_is_compiled_once_that_was_done_ahead():
+    compile_ahead(lambda: None)
+    listener = RecordingListener()
+    with install_listener("numba:compile", listener):
+        found = detect(photo(GLARE[0]), parse_document(TARGET_YAML, Target, "target.yaml"))
+        compile_ahead(lambda: pytest.fail("it is compiled again"))
+    assert found.flags[GLARE[1]] & Flag.REFITTED  # so both fits were made
+    assert listener.buffer == []
+
+
+@pytest.mark.nightly
+def test_what_is_compiled_is_said_once_per_machine_and_no_part_of_the_time_left(tmp_path: Path):
+    picture, target = tmp_path / "picture.png", tmp_path / "target.yaml"
+    picture.write_bytes(encode_png(photo(0)))
+    target.write_text(TARGET_YAML)
+    command = [
+        sys.executable,
+        "-m",
+        "compensation.cli",
+        "detect",
+        picture,
+        "--target",
+        target,
+        "-o",
+        tmp_path / "out.csv",
+    ]
+    said = [
+        subprocess.run(
+            command, env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, capture_output=True, text=True, check=True
+        ).stderr
+        for _ in range(2)
+    ]
+    assert ["compiled" in each for each in said] == [True, False]
+    assert all("left" not in each for each in said)  # one picture takes less than the 3 s from which on it is shown
