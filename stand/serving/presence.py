@@ -1,7 +1,8 @@
 """The daemons that live now: for each an entry and its control socket in the runtime folder.
 
 `ID.json` says which session is run, by which process, on which stand; the daemon keeps it locked (flock), so an entry
-that can be locked was left by a dead one and is removed when it is seen. `ID.sock` is the control socket, mode 0600.
+that can be locked was left by a dead one and is removed when it is seen. `ID.sock` is the control socket, mode 0600,
+and `ID.stop` such another, at which a thread of its own does nothing but stop.
 The runtime folder is on a memory file system and not on the sessions' disk, so that a daemon can be reached and
 identified also when that disk hangs, and when a session's folder was renamed or removed.
 """
@@ -26,7 +27,9 @@ from foundation.lock_file import is_at, remove, take, try_lock
 NAME = "thermostand"
 SYSTEM_FOLDER = Path("/run/lock") / NAME
 STANDS_FOLDER = Path("/run/lock") / f"{NAME}-stands"
-_BACKLOG = 128
+_BACKLOG = 1024
+STOP_SUFFIX = ".stop"
+_SOCKETS = (".sock", STOP_SUFFIX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,7 @@ class Daemon:
 
 
 class Presence:
-    """A daemon's own entry and socket; `appear` before anything else. To be used from any thread."""
+    """A daemon's own entry and sockets; `appear` before anything else. To be used from any thread."""
 
     def __init__(self, entry: Entry) -> None:
         self._lock = threading.RLock()
@@ -59,21 +62,31 @@ class Presence:
         self._path = Path()
         self._file: int | None = None
 
-    def appear(self) -> socket.socket:
-        """Make, or make again, both files; returns the listening socket. SessionError when they cannot be made."""
+    def appear(self) -> tuple[socket.socket, socket.socket]:
+        """Make, or make again, its files; returns the listening sockets, for everything and for STOP alone.
+        SessionError when they cannot be made."""
         path = runtime_folder() / f"{self._id}.json"
         with self._lock:
             try:
                 self._publish(path)
-                return _listening(self._socket)
+                everything = _listening(self._path.with_suffix(".sock"))
+                try:
+                    return everything, _listening(self._path.with_suffix(STOP_SUFFIX))
+                except OSError:
+                    everything.close()
+                    raise
             except OSError as error:
                 self.disappear()
                 raise SessionError(f"{path.parent}: no control socket can be made there ({error.strerror})") from error
 
     def is_there(self) -> bool:
-        """Whether both files are still there; a logout removes $XDG_RUNTIME_DIR with all that is in it."""
+        """Whether its files are still there; a logout removes $XDG_RUNTIME_DIR with all that is in it."""
         with self._lock, suppress(OSError):
-            return self._file is not None and is_at(self._file, self._path) and self._socket.is_socket()
+            return (
+                self._file is not None
+                and is_at(self._file, self._path)
+                and all(self._path.with_suffix(each).is_socket() for each in _SOCKETS)
+            )
         return False
 
     def tell(self, entry: Entry) -> None:
@@ -95,17 +108,14 @@ class Presence:
         threading.Thread(target=look, name="session-folder", daemon=True).start()
 
     def disappear(self) -> None:
-        """Remove both files; may be called twice."""
+        """Remove its files; may be called twice."""
         with self._lock:
             if self._file is not None:
-                with suppress(OSError):
-                    self._socket.unlink()
+                for each in _SOCKETS:
+                    with suppress(OSError):
+                        self._path.with_suffix(each).unlink()
                 remove(self._path, self._file)
                 self._file = None
-
-    @property
-    def _socket(self) -> Path:
-        return self._path.with_suffix(".sock")
 
     def _publish(self, path: Path) -> None:
         """The entry appears whole and locked."""
@@ -172,7 +182,8 @@ def _living(path: Path) -> Daemon | None:
     try:
         if try_lock(file, shared=True):
             if is_at(file, path):
-                path.with_suffix(".sock").unlink(missing_ok=True)
+                for each in _SOCKETS:
+                    path.with_suffix(each).unlink(missing_ok=True)
                 path.unlink(missing_ok=True)
             return None
         with open(file, "rb", closefd=False) as opened:

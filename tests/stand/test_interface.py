@@ -132,7 +132,7 @@ async def test_many_clients_are_served_side_by_side_and_the_most_silent_makes_ro
             clients.append(client)
             assert await is_answered(number)
         assert await is_answered(0)
-        assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
+        assert (await asyncio.to_thread(ask, tmp_path, "pause"))["verb"] == "pause"
         status, answer = await reply(clients[1][0])
         assert (status, await clients[1][0].read()) == (503, b"")
         assert "you were silent longest" in str(answer["error"])
@@ -180,7 +180,7 @@ async def test_only_its_user_may_reach_the_socket_whatever_the_umask(tmp_path: P
             ]
     finally:
         os.umask(before)
-    assert modes == [0o700, 0o600, 0o600]
+    assert modes == [0o700, 0o600, 0o600, 0o600]
 
 
 async def test_paths_longer_than_the_kernel_takes_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -113,7 +113,7 @@ async def test_what_a_killed_daemon_left_is_nobodys_and_is_removed(
     assert (entry.session, entry.pid, entry.stand) == (str(tmp_path), process.pid, "a stand")
     process.kill()
     process.wait()
-    assert len(list(runtime_folder.iterdir())) == 2
+    assert {path.suffix for path in runtime_folder.iterdir()} == {".json", ".sock", ".stop"}
     with pytest.raises(SessionError, match="no daemon is running this session"):
         ask(tmp_path, "stop")
     assert list(runtime_folder.iterdir()) == []
@@ -182,7 +182,9 @@ async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: byt
 
     presence = Presence(Entry(str(tmp_path), os.getpid(), STAND))
     try:
-        async with await asyncio.start_unix_server(talk, sock=presence.appear()):
+        everything, stop = presence.appear()
+        stop.close()
+        async with await asyncio.start_unix_server(talk, sock=everything):
             with pytest.raises(SessionError, match=sentence):
                 await asyncio.to_thread(ask_status, tmp_path)
     finally:

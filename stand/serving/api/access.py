@@ -20,10 +20,12 @@ import ipaddress
 import pwd
 import secrets
 import socket
+import struct
 import time
 from collections.abc import Awaitable, Callable, Iterable, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from http import HTTPStatus
 from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
@@ -44,6 +46,7 @@ LOGIN_PATH, INVITE_PATH = "/login", "/api/v1/login"
 CHECK_PATH = "/api/v1/run/plan/check"
 _CHANGES_NOTHING = frozenset({STOP_PATH, INVITE_PATH, CHECK_PATH})
 COOKIE = "thermostand"
+FAILED = "failed ({}); the stand's events say more"  # by what should not happen
 BODY_LIMIT_BYTES = 1 << 20
 _BODY_LIMIT_S = 10.0
 _LOGIN_S = 600.0
@@ -51,6 +54,7 @@ _SESSION_S = 30 * 86400.0
 _MOST_LOGINS = 100
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
+_PEER = struct.Struct("3i")
 _PROXIED = frozenset({b"forwarded", b"x-forwarded-for", b"x-forwarded-host", b"x-real-ip", b"via"})
 
 CSP = (
@@ -136,6 +140,16 @@ class Access:
             return None
         return Who(name="", how="loopback", read_only=self.trusts_loopback == "read-only")
 
+    def admit(self, scope: Scope) -> Who:
+        """Who asks and may, whoever is asked for whatever; Denied."""
+        self.check(scope)
+        who = self.who(scope)
+        if who is None and not is_open(scope["path"]):
+            raise Denied(401, "this needs a token: an Authorization header, or the address of `stand token login`")
+        if who is not None and who.read_only and _may_change(scope):
+            raise Denied(403, f"{_whose(who)} may look and press STOP, but order nothing: it is read-only")
+        return who or Who(name="", how="network")
+
     def check(self, scope: Scope) -> None:
         """Host and Origin; Denied."""
         headers = cast("Headers", scope["headers"])
@@ -198,6 +212,13 @@ def user_name(uid: object) -> str:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
         return str(uid)
+
+
+def uid_of(connection: socket.socket) -> int | None:
+    """The user at the other end of a Unix socket."""
+    with suppress(OSError):
+        return _PEER.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
+    return None
 
 
 def is_loopback(host: str) -> bool:
@@ -294,15 +315,10 @@ class Gatekeeper:
         """One request, or one viewer."""
         if scope["type"] not in ("http", "websocket"):
             return
-        answering = _Answering(send, self._pace, is_last=scope["type"] == "http" and _is_in_chunks(scope))
+        answering = _Answering(send, self._pace, is_last=_is_last(scope))
         try:
-            self._access.check(scope)
-            who = self._access.who(scope)
-            if who is None and not is_open(scope["path"]):
-                raise Denied(401, "this needs a token: an Authorization header, or the address of `stand token login`")
-            if who is not None and who.read_only and _may_change(scope):
-                raise Denied(403, f"{_whose(who)} may look and press STOP, but order nothing: it is read-only")
-            scope["state"] = {**(scope.get("state") or {}), "who": who or Who(name="", how="network")}
+            who = self._access.admit(scope)
+            scope["state"] = {**(scope.get("state") or {}), "who": who}
             if scope.get("method") == "HEAD":  # as GET; uvicorn sends the head of its answer only
                 scope = {**scope, "method": "GET"}
             if scope["type"] == "http" and scope["path"] != STOP_PATH:
@@ -316,7 +332,7 @@ class Gatekeeper:
             await _refuse(scope, answering, denied.status, str(denied))
         except Exception as error:  # noqa: BLE001 - after a request that fails, the next must be answered
             self._failed(error)
-            await _refuse(scope, answering, 500, f"failed ({type(error).__name__}); the stand's events say more")
+            await _refuse(scope, answering, 500, FAILED.format(type(error).__name__))
         finally:
             self._pace.spent()
 
@@ -369,6 +385,12 @@ def _is_in_chunks(scope: Scope) -> bool:
     return bool(_all(scope["headers"], b"transfer-encoding"))
 
 
+def _is_last(scope: Scope) -> bool:
+    """Whether a connection ends with this answer. By TCP each does: STOP is looked for in what a connection says first
+    (stop_thread.py), and a browser would send it behind what the page has asked for on another one."""
+    return scope["type"] == "http" and (_is_in_chunks(scope) or (scope.get("state") or {}).get("door") == "tcp")
+
+
 async def _whole_body(scope: Scope, receive: Receive) -> Receive:
     """The body, within its limits, before anything is done for it. Denied when it is longer or slower."""
     if (length := _one(scope["headers"], b"content-length")) is not None:
@@ -414,10 +436,25 @@ async def _refuse(scope: Scope, send: _Answering, status: int, sentence: str) ->
             await send({"type": "websocket.close", "code": 1008, "reason": sentence})
         return
     body = json_of({"error": sentence}).encode()
-    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
-    if status == 401:
-        headers.append((b"www-authenticate", b"Bearer"))
+    headers = _headers(status, body)
     if status in (408, 411, 413):
         headers.append((b"connection", b"close"))
     await send({"type": f"{prefix}.response.start", "status": status, "headers": headers})
     await send({"type": f"{prefix}.response.body", "body": body})
+
+
+def _headers(status: int, body: bytes) -> list[tuple[bytes, bytes]]:
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    return [*headers, (b"www-authenticate", b"Bearer")] if status == 401 else headers
+
+
+def last_answer(status: int, body: bytes) -> bytes:
+    """A whole answer with this JSON, after which the connection ends."""
+    headers = (*_headers(status, body), *_HEADERS, (b"connection", b"close"))
+    lines = (f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode(), *map(b": ".join, headers), b"", body)
+    return b"\r\n".join(lines)
+
+
+def last_refusal(status: int, sentence: str) -> bytes:
+    """As `last_answer`."""
+    return last_answer(status, json_of({"error": sentence}).encode())

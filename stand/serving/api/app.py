@@ -13,7 +13,7 @@ from starlette.routing import Match
 
 from foundation.document_faults import path_text
 from foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
-from stand.serving.api.access import Access, App, Gatekeeper
+from stand.serving.api.access import FAILED, Access, App, Gatekeeper
 from stand.serving.api.bridge import Bridge, NoAnswer
 from stand.serving.api.doors import Interface
 from stand.serving.api.order_routes import commands
@@ -109,7 +109,7 @@ def _allowed(request: Request) -> list[str]:
 
 def _failed(_: Request, error: Exception) -> Response:
     """What should not happen; the gatekeeper gets it as well."""
-    return _error(500, f"failed ({type(error).__name__}); the stand's events say more")
+    return _error(500, FAILED.format(type(error).__name__))
 
 
 _SENTENCES = {

@@ -11,6 +11,7 @@ import asyncio
 import concurrent.futures
 import inspect
 import math
+import threading
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
@@ -58,7 +59,7 @@ class Snapshot:
 
 class Bridge:
     """Made, opened and closed on the control loop; `fresh`, `take`, `ask`, `command`, `stop` and `plan` are for the
-    other side.
+    other side, `stopping` is for any thread.
 
     The numbers of the stream go up from one daemon to the next, too: they begin at the time of its start.
     """
@@ -75,7 +76,8 @@ class Bridge:
         self._plan: tuple[PlanStep, ...] | None = None
         self._plan_at_s = 0.0
         self._tasks: set[asyncio.Task[None]] = set()
-        self._stopping: asyncio.Future[Done] | None = None  # on the other side
+        self._stop_lock = threading.Lock()
+        self._stopping: concurrent.futures.Future[Done] | None = None
         self._stopped_s = -math.inf
         self._refreshing: asyncio.Future[None] | None = None
         self._next: asyncio.TimerHandle | None = None
@@ -136,14 +138,13 @@ class Bridge:
         it may still be done."""
         answer: concurrent.futures.Future[Result] = concurrent.futures.Future()
         self._hand_over(lambda: self._called(call, answer))
-        try:
-            return await asyncio.wait_for(asyncio.wrap_future(answer), limit_s)
-        except TimeoutError:
-            raise NoAnswer(f"the stand has not answered within {limit_s:g} s; it may still do what was asked") from None
+        return await _within(limit_s, asyncio.wrap_future(answer))
 
     async def command(self, call: Callable[[Desk], Done | Awaitable[Done]]) -> Done:
         """As `ask`, with the number of the command's event."""
+        return await self.ask(self._numbered(call))
 
+    def _numbered(self, call: Callable[[Desk], Done | Awaitable[Done]]) -> Callable[[Desk], Awaitable[Done]]:
         async def numbered(desk: Desk) -> Done:
             before = self._command_seq
             done = call(desk)
@@ -151,21 +152,26 @@ class Bridge:
             self._refresh_within(0.0)
             return done.model_copy(update={"seq": self._command_seq}) if self._command_seq > before else done
 
-        return await self.ask(numbered)
+        return numbered
+
+    def stopping(self, who: Who) -> concurrent.futures.Future[Done]:
+        """The stop that is on its way, begun if there is none; from any thread. One that follows another within 0.1 s
+        is done when these are over, with all that came until then. It ends as `ask`, but without a limit, and is not
+        to be cancelled: a thousand who stop share it."""
+        with self._stop_lock:
+            if self._stopping is None or self._stopping.done():
+                stopping = self._stopping = concurrent.futures.Future[Done]()
+                try:
+                    self._hand_over(lambda: self._begin_stop(who, stopping))
+                except NoAnswer as error:
+                    stopping.set_exception(error)
+            return self._stopping
 
     async def stop(self, who: Who) -> Done:
-        """Stop, before anything else that waits to be called. Stops that come while one is on its way are that one;
-        one that follows within 0.1 s is done when these are over, with all that came until then."""
-        if self._stopping is None:
-            self._stopping = asyncio.ensure_future(self._stop(who))
-            self._stopping.add_done_callback(self._has_stopped)
-        return await asyncio.shield(self._stopping)
-
-    async def _stop(self, who: Who) -> Done:
-        if (wait_s := self._stopped_s + _STOPPED_S - time.monotonic()) > 0.0:
-            await asyncio.sleep(wait_s)
-        self._stopped_s = time.monotonic()
-        return await self.command(lambda desk: desk.stop(who))
+        """Stop, as `stopping`. NoAnswer as `ask`."""
+        stopping = asyncio.wrap_future(self.stopping(who))
+        stopping.add_done_callback(lambda each: each.cancelled() or each.exception())  # others have it, too
+        return await _within(COMMAND_LIMIT_S, asyncio.shield(stopping))
 
     async def fresh(self) -> Snapshot:
         """The stand as it is now; the last snapshot when the control loop has no time for another one."""
@@ -193,16 +199,19 @@ class Bridge:
         if not refreshing.cancelled():
             refreshing.exception()
 
-    def _has_stopped(self, stopping: asyncio.Future[Done]) -> None:
-        self._stopping = None
-        if not stopping.cancelled():
-            stopping.exception()
-
     def _hand_over(self, call: Callable[[], None]) -> None:
         try:
             self._loop.call_soon_threadsafe(call)
         except RuntimeError:  # it is closed
             raise NoAnswer("the daemon has ended") from None
+
+    def _begin_stop(self, who: Who, stopping: concurrent.futures.Future[Done]) -> None:
+        """On the control loop."""
+        if (wait_s := self._stopped_s + _STOPPED_S - time.monotonic()) > 0.0:
+            self._loop.call_later(wait_s, self._begin_stop, who, stopping)
+            return
+        self._stopped_s = time.monotonic()
+        self._called(self._numbered(lambda desk: desk.stop(who)), stopping)
 
     def _called(
         self, call: Callable[[Desk], Result | Awaitable[Result]], answer: concurrent.futures.Future[Result]
@@ -228,6 +237,19 @@ class Bridge:
             _give(answer, await result)
         except Exception as error:  # noqa: BLE001 - it belongs to who asked
             _give(answer, error)
+
+
+def no_answer(limit_s: float) -> NoAnswer:
+    """That of a control loop which has taken longer."""
+    return NoAnswer(f"the stand has not answered within {limit_s:g} s; it may still do what was asked")
+
+
+async def _within(limit_s: float, answer: Awaitable[Result]) -> Result:
+    try:
+        async with asyncio.timeout(limit_s):  # wait_for may lose a cancellation that comes with the answer
+            return await answer
+    except TimeoutError:
+        raise no_answer(limit_s) from None
 
 
 def _give(answer: concurrent.futures.Future[Result], result: Result | Exception) -> None:

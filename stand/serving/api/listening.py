@@ -13,7 +13,6 @@ import asyncio
 import os
 import select
 import socket
-import struct
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Protocol, cast
@@ -24,8 +23,9 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from uvicorn.server import ServerState
 from websockets.frames import CloseCode
 
+from stand.serving.api.access import last_refusal, uid_of
 from stand.serving.api.pace import Pace
-from stand.serving.api.stream import json_of
+from stand.serving.api.stop_thread import Others
 
 MOST_CLIENTS = 64  # a script that leaks connections must not take the files the recording needs
 _MOST_ASKING = 96  # when all of them wait for an answer
@@ -37,10 +37,12 @@ _NO_DESCRIPTOR_PAUSE_S = 0.1
 _ASK_WITHIN_S = 10.0  # a whole request's head, from the first moment or the answer before
 _IDLE_LIMIT_S = 60.0
 _FAREWELL_LIMIT_S = 1.0  # for clients that do not read their last answer
+_BACKLOG = 1024  # of whom it overflows, a connection is tried again by the kernel after 1 s
 _PIECE_BYTES = 4096  # of what a client sends, looked at before more of it is taken apart
 # A browser answers a ping each 20 s with 10 bytes. A read counts as 64 bytes at least: eight a second, 64 at once.
 _VIEWER_BYTES_PER_S, _VIEWER_BURST_BYTES, _LEAST_BYTES = 512, 4096, 64
-_PEER = struct.Struct("3i")
+
+Door = socket.socket | Others
 
 
 class _Connection(Protocol):
@@ -82,7 +84,7 @@ class _Client(H11Protocol):
 
     def send_400_response(self, msg: str) -> None:
         """A sentence, as for everything that is refused."""
-        _hang_up(self.transport, "400 Bad Request", "this is no HTTP request, or its head is longer than 32 KiB")
+        _hang_up(self.transport, 400, "this is no HTTP request, or its head is longer than 32 KiB")
 
     @property
     def is_answering(self) -> bool:
@@ -143,7 +145,7 @@ class Listening:
         self._server = ServerState()
         self._pace = pace
         self._loop = asyncio.get_running_loop()
-        self._doors: dict[str, socket.socket] = {}
+        self._doors: dict[str, Door] = {}
         self._welcoming: set[asyncio.Task[object]] = set()
         self._spares: list[int] = []
         self._is_open = True
@@ -154,10 +156,10 @@ class Listening:
         """How many are connected, viewers included."""
         return len(self._server.connections)
 
-    def listen(self, door: str, listening: socket.socket) -> None:
-        """Accept at this socket from now on, instead of the one of that door before; door: "socket" or "tcp"."""
+    def listen(self, door: str, listening: Door) -> None:
+        """Accept here from now on, without blocking, instead of the one of that door before; door: "socket" or
+        "tcp"."""
         self._shut(door)
-        listening.setblocking(False)
         self._doors[door] = listening
         self._loop.add_reader(listening, self._knocked, door)
 
@@ -229,13 +231,13 @@ class Listening:
             self._loop.remove_reader(listening)
             self._loop.call_later(pause_s, self._await_knock, door, listening)
 
-    def _await_knock(self, door: str, listening: socket.socket) -> None:
+    def _await_knock(self, door: str, listening: Door) -> None:
         if self._doors.get(door) is listening:
             self._loop.add_reader(listening, self._knocked, door)
 
     def _welcome(self, door: str, connection: socket.socket) -> None:
         connection.setblocking(False)
-        state = {"door": door, "uid": _uid(connection) if door == "socket" else None}
+        state = {"door": door, "uid": uid_of(connection) if door == "socket" else None}
 
         def protocol() -> _Client:
             return _Client(self._config, self._server, state, self._loop)
@@ -272,7 +274,7 @@ class Listening:
             return False
         client = silent[0]
         if not client.is_answering:
-            _hang_up(client.transport, "503 Service Unavailable", sentence)
+            _hang_up(client.transport, 503, sentence)
         else:
             client.transport.abort()
         self._server.connections.discard(client)
@@ -284,25 +286,16 @@ class Listening:
                 self._spares.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
 
 
-def _hang_up(transport: asyncio.Transport, status: str, sentence: str) -> None:
+def _hang_up(transport: asyncio.Transport, status: int, sentence: str) -> None:
     """The reason, as far as the client takes it, and the end."""
-    body = json_of({"error": sentence}).encode()
-    head = f"HTTP/1.1 {status}\r\ncontent-type: application/json\r\ncontent-length: {len(body)}\r\n"
-    transport.write(head.encode() + b"connection: close\r\n\r\n" + body)
+    transport.write(last_refusal(status, sentence))
     transport.close()
 
 
-def _is_readable(listening: socket.socket) -> bool:
+def _is_readable(listening: Door) -> bool:
     poll = select.poll()  # select.select takes no descriptor above 1023
     poll.register(listening, select.POLLIN)
     return bool(poll.poll(0))
-
-
-def _uid(connection: socket.socket) -> int | None:
-    """The user at the other end of a Unix socket."""
-    with suppress(OSError):
-        return _PEER.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
-    return None
 
 
 def listening_at(host: str, port: int) -> socket.socket:
@@ -312,7 +305,8 @@ def listening_at(host: str, port: int) -> socket.socket:
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind(address)
-        listening.listen(128)
+        listening.setblocking(False)
+        listening.listen(_BACKLOG)
     except OSError:
         listening.close()
         raise

@@ -1,4 +1,5 @@
-"""The thread that serves a stand's clients: `serve` on the control loop, everything else in the thread's own loop."""
+"""The threads that serve a stand's clients: `serve` is on the control loop, STOP has a thread of its own, and all else
+the loop of another."""
 
 from __future__ import annotations
 
@@ -20,9 +21,11 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.patience import Patience
 from foundation.tasks import failure_text
+from stand.serving.api.access import Access
 from stand.serving.api.bridge import Bridge
 from stand.serving.api.doors import Interface, OtherDoor
 from stand.serving.api.pace import Pace
+from stand.serving.api.stop_thread import StopThread
 from stand.serving.desk import Desk
 from stand.serving.presence import Entry, Presence
 
@@ -49,17 +52,25 @@ async def serve(
     """
     interface.check()
     presence = Presence(Entry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
-    doors = {"socket": presence.appear()}
+    report, patience = _reporter(hub, clock), patience or Patience()
+    everything, stopping = presence.appear()
+    doors = {"socket": everything, "stop": stopping}
     try:
         doors.update(_tcp_doors(interface))
         bridge = Bridge(desk, hub, clock)
+        access = Access(interface.tokens, interface.hosts, interface.trusts_loopback)
+        stop = StopThread(bridge.stopping, access, lambda error: report("interface_failed", _failure(error)))
     except BaseException:
         for door in doors.values():
             door.close()
         presence.disappear()
         raise
-    thread = _Thread(bridge, doors, presence, interface, _reporter(hub, clock))
+    thread = _Thread(bridge, doors, presence, interface, access, stop, report)
     try:
+        for door in ("stop", "tcp"):
+            if door in doors:
+                stop.listen(door, doors[door])
+        stop.start()
         thread.start()
         presence.identify()
         with clock.hold():  # virtual time would be over before the first client is answered
@@ -69,7 +80,10 @@ async def serve(
     finally:
         bridge.close()
         with clock.hold():  # a client that does not read must not be where virtual time goes on
-            await asyncio.to_thread(thread.end, (patience or Patience()).left_s(_CLOSE_LIMIT_S))
+            for ending in (thread, stop):
+                await asyncio.to_thread(ending.end, patience.left_s(_CLOSE_LIMIT_S))
+        for door in doors.values():
+            door.close()
         presence.disappear()
 
 
@@ -140,12 +154,16 @@ class _Thread:
         doors: dict[str, socket.socket],
         presence: Presence,
         interface: Interface,
+        access: Access,
+        stop: StopThread,
         report: Callable[[str, str], None],
     ) -> None:
         self._bridge = bridge
         self._doors = doors
         self._presence = presence
         self._interface = interface
+        self._access = access
+        self._stop = stop
         self._report = report
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ended: asyncio.Event | None = None
@@ -172,26 +190,25 @@ class _Thread:
             self._report("no_control", f"the run cannot be queried or paused: {failure_text(error)}")
         finally:
             self.is_ready.set()
-            for door in self._doors.values():
-                door.close()
+            for door, listening in self._doors.items():
+                if door not in ("stop", "tcp"):
+                    listening.close()
 
     async def _main(self) -> None:
         # Imported here: nothing else of the program needs them, and they take half a second.
-        from stand.serving.api.access import Access
         from stand.serving.api.app import make_app
         from stand.serving.api.listening import Listening
         from stand.serving.api.stream import Stream
 
         pace, stream = Pace(), Stream(self._bridge)
-        access = Access(self._interface.tokens, self._interface.hosts, self._interface.trusts_loopback)
-        app = make_app(self._bridge, stream, access, pace, self._interface, self._failed)
+        app = make_app(self._bridge, stream, self._access, pace, self._interface, self._failed)
         listening = Listening(app, pace)
         self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
         if self._is_over.is_set():
             self._ended.set()
-        for door, each in self._doors.items():
-            if door in ("socket", "tcp"):
-                listening.listen(door, each)
+        listening.listen("socket", self._doors["socket"])
+        if "tcp" in self._doors:
+            listening.listen("tcp", self._stop.others)
         working = [asyncio.create_task(stream.run()), asyncio.create_task(self._look_after(listening))]
         working += [asyncio.create_task(self._serve(each, pace)) for each in self._interface.doors]
         self.is_ready.set()
@@ -210,14 +227,23 @@ class _Thread:
             self._report("no_control", f"what {door.option} asked for is not served: {failure_text(error)}")
 
     async def _look_after(self, listening: Any) -> None:
-        """A logout removes $XDG_RUNTIME_DIR with the socket that is in it."""
+        """A logout removes $XDG_RUNTIME_DIR with the sockets that are in it."""
+        is_alone = False
         while True:
             await asyncio.sleep(_LOOK_S)
             listening.look_after()
+            if self._stop.has_failed and not is_alone and "tcp" in self._doors:
+                is_alone = True
+                listening.listen("tcp", self._doors["tcp"])
             if not self._presence.is_there():
                 with suppress(SessionError, StandError):  # tried again the next time
-                    self._doors["socket"] = self._presence.appear()
+                    self._doors["socket"], self._doors["stop"] = self._presence.appear()
                     listening.listen("socket", self._doors["socket"])
+                    self._stop.listen("stop", self._doors["stop"])
 
     def _failed(self, error: Exception) -> None:
-        self._report("interface_failed", f"the interface has failed: {failure_text(error)}")
+        self._report("interface_failed", _failure(error))
+
+
+def _failure(error: Exception) -> str:
+    return f"the interface has failed: {failure_text(error)}"

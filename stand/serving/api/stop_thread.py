@@ -1,0 +1,364 @@
+"""The thread that serves STOP, and does nothing else for anybody.
+
+It accepts at the TCP port, and at a Unix socket for the command line. What a connection says first is looked at and
+left in the kernel: a request for STOP is answered here, without its body; every other connection is handed over as it
+is. Whatever the others do meanwhile, a STOP waits for this thread's turn only, which is a few system calls. Who says
+nothing makes room for the next.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import errno
+import os
+import select
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Literal
+
+import h11
+
+from stand.serving.api.access import FAILED, STOP_PATH, Access, Denied, Scope, last_answer, last_refusal, uid_of
+from stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, no_answer
+from stand.serving.api.pace import Pace
+from stand.serving.desk import Done, Who
+
+Door = Literal["stop", "tcp"]
+Stopping = Callable[[Who], "concurrent.futures.Future[Done]"]
+
+_MOST_CLIENTS = 128  # of a door, who have not been answered or handed over
+_MOST_OTHERS = 64  # handed over, and not taken yet
+_AT_ONCE = 16
+_REST_S = 0.01  # at most, however much is asked of this thread
+_MAY_SPEAK_S = 0.02  # between connecting and speaking, on a busy machine: who is younger is not sent away
+_HEAD_BYTES = 1 << 15
+_ASK_WITHIN_S = 10.0
+_DRAIN_S = 1.0  # for what a client still sends: closed before it is read, the answer would be lost
+_LOOK_S = 0.1
+_SPARES = 2
+_REQUEST = f"POST {STOP_PATH}".encode()
+
+
+class Others:
+    """Connections that want something else, to be accepted as from a listening socket by another thread; without a
+    spare descriptor for this one, accept fails as that of a socket does."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[socket.socket] = deque()
+        self._count = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._lock = threading.Lock()
+        self._spares: list[int] = []
+        self._is_open = True
+
+    def fileno(self) -> int:
+        """Readable while one waits."""
+        return self._count
+
+    def accept(self) -> tuple[socket.socket, object]:
+        """The one that has waited longest; BlockingIOError when there is none."""
+        self.keep_spares()
+        with self._lock:
+            os.eventfd_read(self._count)
+            return self._waiting.popleft(), None
+
+    def close(self) -> None:
+        """Nobody takes them any more."""
+        with self._lock:
+            if self._is_open:
+                self._is_open = False
+                os.close(self._count)
+            while self._waiting:
+                self._waiting.popleft().close()
+            while self._spares:
+                os.close(self._spares.pop())
+
+    @property
+    def has_room(self) -> bool:
+        """Whether one more may wait."""
+        return self._is_open and len(self._waiting) < _MOST_OTHERS
+
+    def give(self, connection: socket.socket) -> None:
+        """One more, which is closed when nobody takes any."""
+        with self._lock:
+            if self._is_open:
+                self._waiting.append(connection)
+                os.eventfd_write(self._count, 1)
+            else:
+                connection.close()
+
+    def make_room(self) -> bool:
+        """Whether a descriptor was freed."""
+        with self._lock:
+            if self._spares:
+                os.close(self._spares.pop())
+            elif self._waiting:
+                os.eventfd_read(self._count)
+                self._waiting.popleft().close()
+            else:
+                return False
+        return True
+
+    def keep_spares(self) -> None:
+        """OSError when there is no descriptor for one."""
+        while self._is_open and len(self._spares) < _SPARES:
+            self._spares.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+
+
+class _Client:
+    """One connection: it has said nothing that is understood, or waits for `answer`, or `has_answer` and is listened to
+    no more; until `until_s`."""
+
+    def __init__(self, door: Door, connection: socket.socket, now_s: float) -> None:
+        self.door: Door = door
+        self.connection = connection
+        self.came_s = now_s
+        self.until_s = now_s + _ASK_WITHIN_S
+        self.answer: concurrent.futures.Future[Done] | None = None
+        self.has_answer = False
+
+    def may_leave(self, now_s: float) -> bool:
+        """Whether it makes room for another."""
+        return self.has_answer or (self.answer is None and now_s > self.came_s + _MAY_SPEAK_S)
+
+    def scope(self, request: h11.Request) -> Scope:
+        """Its request, as the gatekeeper gets it."""
+        is_local = self.connection.family == socket.AF_UNIX
+        there, here = (None, None) if is_local else (self.connection.getpeername(), self.connection.getsockname())
+        return {
+            "type": "http",
+            "method": "POST",
+            "path": STOP_PATH,
+            "headers": list(request.headers),
+            "client": there,
+            "server": here,
+            "state": {"door": "socket" if is_local else "tcp", "uid": uid_of(self.connection) if is_local else None},
+        }
+
+
+class StopThread:
+    """From `start` to `end`; `listen`, `start` and `end` are for any thread. others: who comes by TCP for something
+    else. `stopping` as that of the bridge; `failed` is called with what should not happen."""
+
+    def __init__(self, stopping: Stopping, access: Access, failed: Callable[[Exception], None]) -> None:
+        self.others = Others()
+        self.has_failed = False
+        self._stopping = stopping
+        self._access = access
+        self._failed = failed
+        self._doors: dict[int, tuple[Door, socket.socket]] = {}
+        self._new: deque[tuple[Door, socket.socket]] = deque()
+        self._clients: dict[int, _Client] = {}
+        self._epoll = select.epoll()
+        self._called = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._epoll.register(self._called, select.EPOLLIN)
+        self._is_over = threading.Event()
+        self._is_crowded = False
+        self._thread = threading.Thread(target=self._run, name="stop", daemon=True)
+
+    def listen(self, door: Door, listening: socket.socket) -> None:
+        """Accept at this socket from now on, which does not block, instead of the one of that door before."""
+        self._new.append((door, listening))
+        self._call()
+        if self.has_failed:
+            listening.close()
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def end(self, within_s: float) -> None:
+        """Wait for it so long: answers that are due within a second are still given."""
+        self._is_over.set()
+        self._call()
+        self._thread.join(within_s)
+        self.others.close()
+
+    def _call(self, _: object = None) -> None:
+        with suppress(OSError):  # it has ended
+            os.eventfd_write(self._called, 1)
+
+    def _run(self) -> None:
+        pace = Pace()
+        try:
+            while not self._is_over.is_set():
+                self._turn()
+                if rest_s := _REST_S if self._is_crowded else min(_REST_S, pace.spent()):
+                    self._is_over.wait(rest_s)
+            self._leave()
+        except Exception as error:  # noqa: BLE001 - the framework has a route for STOP, too
+            self.has_failed = True
+            self._failed(error)
+        finally:
+            for client in self._clients.values():
+                client.connection.close()
+            for door, listening in self._doors.values():
+                if door == "stop" or not self.has_failed:  # whoever accepts at the port now has STOP, too
+                    listening.close()
+            self._epoll.close()
+            os.close(self._called)
+
+    def _leave(self) -> None:
+        for number in self._doors:
+            self._epoll.unregister(number)
+        until_s = time.monotonic() + _DRAIN_S
+        while any(each.answer or each.has_answer for each in self._clients.values()) and time.monotonic() < until_s:
+            self._turn()
+
+    def _turn(self) -> None:
+        """Everybody who has said something, then those who are new."""
+        events = self._epoll.poll(_LOOK_S if self._clients else None)
+        for number, _ in events:
+            if (client := self._clients.get(number)) is not None:
+                self._hear(client)
+        self._is_crowded = False
+        for number, _ in events:
+            if (door := self._doors.get(number)) is not None:
+                self._accept(*door)
+        with suppress(BlockingIOError):
+            os.eventfd_read(self._called)
+        while self._new:
+            self._open(*self._new.popleft())
+        self._look()
+
+    def _open(self, door: Door, listening: socket.socket) -> None:
+        for number, (name, before) in (*self._doors.items(),):
+            if name == door:
+                del self._doors[number]
+                self._epoll.unregister(number)
+                before.close()
+        self._doors[listening.fileno()] = (door, listening)
+        self._epoll.register(listening, select.EPOLLIN)
+
+    def _accept(self, door: Door, listening: socket.socket) -> None:
+        for _ in range(_AT_ONCE):
+            if not self._has_room(door):
+                self._is_crowded = True
+                return
+            try:
+                connection, _ = listening.accept()
+            except BlockingIOError:
+                return
+            except (InterruptedError, ConnectionAbortedError):
+                continue
+            except OSError as error:
+                if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM) and self._make_room():
+                    continue
+                self._is_crowded = True
+                return
+            with suppress(OSError):
+                self.others.keep_spares()
+            connection.setblocking(False)
+            client = self._clients[connection.fileno()] = _Client(door, connection, time.monotonic())
+            self._epoll.register(connection, select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET)
+            self._hear(client)  # it has mostly said something by now
+
+    def _has_room(self, door: Door) -> bool:
+        clients = [each for each in self._clients.values() if each.door == door]
+        if len(clients) < _MOST_CLIENTS:
+            return True
+        now_s = time.monotonic()
+        leaving = [each for each in clients if each.may_leave(now_s)]
+        if leaving:
+            self._drop(min(leaving, key=lambda each: (not each.has_answer, each.came_s)))
+        return bool(leaving)
+
+    def _make_room(self) -> bool:
+        """Whether there is a descriptor now, which there was not."""
+        silent = [each for each in self._clients.values() if each.answer is None or each.has_answer]
+        if not silent:
+            return self.others.make_room()
+        self._drop(silent[0])
+        return True
+
+    def _hear(self, client: _Client) -> None:
+        try:
+            if client.has_answer:
+                if not client.connection.recv(1 << 16):
+                    self._drop(client)
+            elif client.answer is None:
+                self._understand(client, client.connection.recv(_HEAD_BYTES, socket.MSG_PEEK))
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(client)
+        except Exception as error:  # noqa: BLE001 - after a client that fails, the next must be answered
+            self._failed(error)
+            self._answer(client, last_refusal(500, FAILED.format(type(error).__name__)))
+
+    def _understand(self, client: _Client, said: bytes) -> None:
+        if not said:
+            self._drop(client)
+        elif said[: len(_REQUEST)] != _REQUEST[: len(said)]:
+            self._hand_over(client)
+        elif len(said) >= len(_REQUEST):
+            parser = h11.Connection(h11.SERVER, max_incomplete_event_size=_HEAD_BYTES - 1)
+            parser.receive_data(said)
+            try:
+                request = parser.next_event()
+            except h11.RemoteProtocolError:
+                self._hand_over(client)
+                return
+            if isinstance(request, h11.Request):
+                is_stop = request.target.partition(b"?")[0] == STOP_PATH.encode()
+                (self._stop if is_stop else self._hand_over)(client, request)
+
+    def _hand_over(self, client: _Client, _: object = None) -> None:
+        if client.door == "stop":
+            self._answer(client, last_refusal(404, "here is nothing but STOP"))
+        elif not self.others.has_room:
+            self._answer(client, last_refusal(503, f"{_MOST_OTHERS} clients wait already to be let in"))
+        else:
+            self._forget(client)
+            self.others.give(client.connection)
+
+    def _stop(self, client: _Client, request: h11.Request) -> None:
+        try:
+            who = self._access.admit(client.scope(request))
+        except Denied as denied:
+            self._answer(client, last_refusal(denied.status, str(denied)))
+            return
+        client.until_s = time.monotonic() + COMMAND_LIMIT_S
+        client.answer = self._stopping(who)
+        client.answer.add_done_callback(self._call)
+
+    def _look(self) -> None:
+        """Answers that have come, and what takes too long."""
+        now_s = time.monotonic()
+        for client in (*self._clients.values(),):
+            if client.answer is not None and client.answer.done():
+                self._answer(client, _given(client.answer))
+            elif client.answer is not None and now_s > client.until_s:
+                self._answer(client, last_refusal(504, str(no_answer(COMMAND_LIMIT_S))))
+            elif now_s > client.until_s:
+                self._drop(client)
+
+    def _answer(self, client: _Client, answer: bytes) -> None:
+        """All of it fits into what the kernel keeps; then what the client still sends is thrown away for a moment."""
+        client.answer, client.has_answer, client.until_s = None, True, time.monotonic() + _DRAIN_S
+        try:
+            client.connection.send(answer)
+            client.connection.shutdown(socket.SHUT_WR)
+            self._epoll.modify(client.connection, select.EPOLLIN)
+        except OSError:  # it has left
+            self._drop(client)
+
+    def _forget(self, client: _Client) -> None:
+        del self._clients[client.connection.fileno()]
+        self._epoll.unregister(client.connection)
+
+    def _drop(self, client: _Client) -> None:
+        self._forget(client)
+        client.connection.close()
+
+
+def _given(answer: concurrent.futures.Future[Done]) -> bytes:
+    error = answer.exception()
+    if error is None:
+        return last_answer(200, answer.result().model_dump_json().encode())
+    if isinstance(error, NoAnswer):
+        return last_refusal(504, str(error))
+    return last_refusal(500, FAILED.format(type(error).__name__))
