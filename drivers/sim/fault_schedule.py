@@ -66,7 +66,8 @@ class FaultSchedule:
     """Breaks and mends a laboratory, as planned or by hand. `advance` leads virtual time, `tick` follows real time."""
 
     def __init__(self, laboratory: Laboratory, faults: Iterable[PlannedFault]) -> None:
-        """Breaks what is due at the start; ConfigError when this laboratory cannot have it."""
+        """Breaks what is due at the start; ConfigError when this laboratory cannot have what is planned, then or later:
+        each is tried and mended again, but for what happens in an instant and leaves its traces."""
         self._laboratory = laboratory
         self._lock = threading.Lock()
         self._due: list[tuple[int, int, str, object]] = []
@@ -75,6 +76,9 @@ class FaultSchedule:
         self._standing: dict[str, object] = {}
         start_ns = laboratory.now_ns
         for planned in faults:
+            if planned.at_s > 0 and not isinstance(FAULTS[planned.name].apply, Once):
+                self._set(planned.name, planned.value)
+                self._set(planned.name, FAULTS[planned.name].mended)
             at_ns = start_ns + seconds_ns(planned.at_s)
             self._push(at_ns, planned.name, planned.value)
             if planned.for_s is not None:

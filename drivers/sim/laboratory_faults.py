@@ -45,8 +45,9 @@ def _channel(laboratory: Laboratory, value: object) -> set[int]:
 
 def _thermometers(attribute: str, kind: Callable[[Laboratory, object], object]) -> Setter:
     def apply(laboratory: Laboratory, value: object) -> None:
+        changed = kind(laboratory, value)
         for module in laboratory.thermometer_modules:
-            setattr(module, attribute, kind(laboratory, value))
+            setattr(module, attribute, changed)
 
     return apply
 
@@ -87,6 +88,8 @@ def _change_contact(laboratory: Laboratory, value: object) -> None:
 
 
 def _alarm_axis(laboratory: Laboratory, value: object) -> None:
+    if value is not None and value not in laboratory.axes:
+        raise ValueError(f"there is no axis {value}")
     for name, axis in laboratory.axes.items():
         axis.alarm = name == value
 

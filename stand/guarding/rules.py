@@ -195,8 +195,9 @@ def _sensors(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
 
 def _drifts(config: StandConfig) -> tuple[Watch, ...]:
     """The air's thermometer against others in that air: `safety` ones, and the regulator's probe, which shows 0.1 K and
-    sits beside the heater, where it has one."""
-    same, limit_K = (FLAP, "relays.camera_power", RUNNING), config.guard.sensors.drift_K
+    sits beside the heater, where it has one. Gradients in the air are others while the regulator is stopped, and while
+    the compressor runs against the heater: those are states of their own."""
+    same, limit_K = (FLAP, "relays.camera_power", RUNNING, COMPRESSOR), config.guard.sensors.drift_K
     others = dict.fromkeys(safety_thermometers(config), limit_K)
     if config.regulator_unit is not None:
         others[PV] = limit_K + _PV_K
