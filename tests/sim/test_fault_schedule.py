@@ -105,7 +105,7 @@ def test_time_without_a_plan_moves_as_before(laboratory: Laboratory):
 def test_a_plan_for_a_device_that_is_not_there_is_refused(laboratory: Laboratory):
     laboratory.axes.pop("rotary")
     for text in ("rotary.restart", "axis.alarm=rotary@2h", 'thermometer.offset_K={"roof": 1}@10'):
-        with pytest.raises(ConfigError, match="rotary|roof"):
+        with pytest.raises(ConfigError, match=r"rotary|roof"):
             FaultSchedule(laboratory, [parse_fault(text)])
     assert FaultSchedule(laboratory, [parse_fault("bus.unplugged@3:4")]).standing() == {}
     assert not laboratory.link("bus").faults.silent
