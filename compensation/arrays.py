@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from compensation.history.known_states import Column, history_of
 from compensation.history.thermal_history import History
 from compensation.observations import Float, Observations, SessionFacts
+from compensation.sound_values import LARGEST_SIDE_px, check_centres, check_degC
 from experiments.steps import Role
 from foundation.clock import NS_PER_S
 from markers.target import Target
@@ -54,6 +55,7 @@ def observations_of(
     frames, count = centres.shape[:2]
     instants, chamber, roles = _columns(own, time_ns, chamber_degC, role, reference_degC)
     missing, size = np.isnan(centres).any(axis=2) | np.isnan(own)[:, None], image_size or _size_of(centres)
+    check_centres("centres_px", centres, size)
     covariance = _covariance(covariance_px2, sigma_px, missing)
     history = None if air is None else history_of(air, supply, camera, instants, own)
     return Observations(
@@ -113,6 +115,7 @@ def _seen(centres_px: ArrayLike, camera_degC: ArrayLike) -> tuple[Float, Float]:
         raise ValueError(f"centres are (F, N, 2) and temperatures (F,), not {centres.shape} and {camera.shape}")
     if not np.isfinite(centres).all(axis=2).any():
         raise ValueError(f"none of the {len(centres)} frames has a centre: centres_px are all NaN")
+    check_degC("camera_degC", camera)
     return centres, camera
 
 
@@ -125,6 +128,8 @@ def _columns(
 ) -> tuple[NDArray[np.int64], Float, NDArray[np.str_]]:
     """Instants, set-points and roles (F,) of the frames, as given or as supposed; ValueError when one is not (F,)."""
     frames = len(camera_degC)
+    if chamber_degC is not None:
+        check_degC("chamber_degC", _numbers("chamber_degC", chamber_degC))
     instants = np.arange(frames) * NS_PER_S if time_ns is None else np.array(time_ns, np.int64)
     chamber = np.round(camera_degC) if chamber_degC is None else np.array(chamber_degC, np.float64)
     roles = _roles(chamber, reference_degC) if role is None else np.array(role, np.str_)
@@ -140,8 +145,9 @@ def _columns(
 
 
 def _size_of(centres_px: Float) -> tuple[int, int]:
-    """(width, height) of an image that holds all centres (F, N, 2)."""
-    return math.ceil(np.nanmax(centres_px[..., 0])) + 1, math.ceil(np.nanmax(centres_px[..., 1])) + 1
+    """(width, height) of an image that holds all centres (F, N, 2), of at most the size of a sensor."""
+    width, height = np.clip(np.ceil(np.nanmax(centres_px, axis=(0, 1))) + 1, 1, LARGEST_SIDE_px)
+    return int(width), int(height)
 
 
 def _air_at(history: History | None, time_ns: NDArray[np.int64]) -> Float:

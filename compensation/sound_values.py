@@ -8,17 +8,17 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from compensation.drift_runtime import MOST_CORNERS, MOST_IMAGES, COLDEST_degC, HOTTEST_degC
-from compensation.observations import Float
 
-_LARGEST_SIDE_px = 100_000  # four times the largest sensors that are sold
+LARGEST_SIDE_px = 100_000  # four times the largest sensors that are sold
 _FARTHEST_mm = 1e6
 
+Float = NDArray[np.float64]
 Pair = tuple[float, float]
-Side = Annotated[int, Field(gt=0, le=_LARGEST_SIDE_px)]
+Side = Annotated[int, Field(gt=0, le=LARGEST_SIDE_px)]
 Size = tuple[Side, Side]
 Length = Annotated[float, Field(ge=-_FARTHEST_mm, le=_FARTHEST_mm)]
 Degrees = Annotated[float, Field(ge=COLDEST_degC, le=HOTTEST_degC)]
@@ -59,6 +59,26 @@ def check_covariance(name: str, covariance: Float) -> None:
             0
         ] < -_NEGATIVE * size:
             raise ValueError(f"{name}: not positive semidefinite, as a covariance is")
+
+
+def check_degC(name: str, values: ArrayLike) -> None:
+    """Temperatures, NaN where one is not known."""
+    given = np.asarray(values, np.float64).ravel()
+    wrong = np.flatnonzero(~(np.isnan(given) | ((given >= COLDEST_degC) & (given <= HOTTEST_degC))))
+    if len(wrong):
+        raise ValueError(f"{name}: {given[wrong[0]]:g} degC in place {wrong[0]} (from 0); is it in another unit?")
+
+
+def check_centres(name: str, centres_px: Float, image_size: tuple[int, int]) -> None:
+    """(F, N, 2), NaN where a marker is missing; px from the middle of the first pixel."""
+    off = (centres_px < -1.0) | (centres_px > np.array(image_size, np.float64))
+    if off.any():
+        frame, marker, _ = np.argwhere(off)[0]
+        x_px, y_px = centres_px[frame, marker]
+        raise ValueError(
+            f"{name}: marker {marker} of frame {frame} is at ({x_px:g}, {y_px:g}) px, outside the image of "
+            f"{image_size[0]} x {image_size[1]}; px count from the middle of the image's first pixel"
+        )
 
 
 def check_within_image(name: str, moves_px: ArrayLike, image_size: tuple[int, int]) -> None:

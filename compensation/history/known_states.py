@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from compensation.history.states import Float, Memory, States
 from compensation.history.thermal_history import History, recorded_history, refined, states_at
+from compensation.sound_values import check_degC
 from recording.reading.session import Session
 
 Column = tuple[ArrayLike, ArrayLike]
@@ -88,6 +89,8 @@ def _column(name: str, given: Column) -> tuple[NDArray[np.int64], Float]:
         )
     if np.any(np.diff(time_ns) < 0):
         raise ValueError(f"{name}: its time_ns go backwards; give them in order of time")
+    if name != "supply":
+        check_degC(name, values)
     good = np.isfinite(values)
     return time_ns[good], values[good]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import json
+import math
 import os
 import re
 import subprocess
@@ -149,6 +150,13 @@ def test_air_over_time_makes_a_history_for_the_thermal_form():
         ({"covariance_px2": np.ones((12, 2, 2))}, r"covariance_px2 has shape \(12, 2, 2\), not \(12, 24, 2, 2\)"),
         ({"covariance_px2": -np.eye(2)}, r"covariance_px2 of frame 0, marker 0 is no covariance"),
         ({"covariance_px2": np.full((12, 24, 2, 2), np.nan)}, r"covariance_px2 of frame 0, marker 0 is no covariance"),
+        ({"camera_degC": [math.inf] * 12}, r"camera_degC: inf degC in place 0"),
+        ({"camera_degC": [30.0] * 11 + [1e7]}, r"camera_degC: 1e\+07 degC in place 11"),
+        ({"chamber_degC": [-400.0] * 12}, r"chamber_degC: -400 degC in place 0"),
+        ({"air": (np.arange(3), [20.0, math.inf, 20.0])}, r"air: inf degC in place 1"),
+        ({"centres_px": np.full((12, 24, 2), -1e7)}, r"marker 0 of frame 0 is at \(-1e\+07, -1e\+07\) px, outside"),
+        ({"centres_px": np.full((12, 24, 2), 1e7)}, r"marker 0 of frame 0 is at \(1e\+07, 1e\+07\) px, outside"),
+        ({"image_size": (300, 300)}, r"outside the image of 300 x 300"),
         ({"sigma_px": 0.0}, r"sigma_px is 0.0; expected one above 0"),
         ({"air": np.zeros(12)}, r"air: expected \(time_ns, values\)"),
         ({"air": (np.zeros(3), np.zeros(4))}, r"air: expected \(time_ns, values\), two columns of the same length"),
