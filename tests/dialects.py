@@ -105,6 +105,55 @@ ABS = (
 )
 
 
+# As Basler's ace 2: one register of each trigger, among which a selector in the client's own memory chooses.
+SELECTED = (
+    '<Enumeration Name="TriggerSelector"><EnumEntry Name="FrameBurstStart"><Value>0</Value></EnumEntry>'
+    '<EnumEntry Name="FrameStart"><Value>3</Value></EnumEntry><pValue>Selected</pValue></Enumeration>\n'
+    + '<Integer Name="Selected"><Value>3</Value></Integer>\n'
+    + '<Command Name="TriggerSoftware"><pValue>SoftwareOf</pValue><CommandValue>1</CommandValue></Command>\n'
+    + '<Integer Name="SoftwareOf"><pIndex>Selected</pIndex><pValueIndexed Index="0">BurstSoftware</pValueIndexed>'
+    + '<pValueIndexed Index="3">FrameSoftware</pValueIndexed><pValueDefault>BurstSoftware</pValueDefault></Integer>\n'
+    + register("BurstSoftware", 0xB010, "WO")
+    + register("FrameSoftware", 0xB014, "WO")
+    + '<Enumeration Name="TriggerMode"><EnumEntry Name="Off"><Value>0</Value></EnumEntry><EnumEntry Name="On">'
+    + "<Value>1</Value></EnumEntry><pValue>ModeOf</pValue></Enumeration>\n"
+    + '<Integer Name="ModeOf"><pIndex>Selected</pIndex><pValueIndexed Index="0">BurstMode</pValueIndexed>'
+    + '<pValueIndexed Index="3">FrameMode</pValueIndexed><pValueDefault>BurstMode</pValueDefault></Integer>\n'
+    + register("BurstMode", 0xB000)
+    + register("FrameMode", 0xB004)
+    + SOURCE
+)
+
+# As Basler's scout: raw steps of a base that counts the ticks of a clock, and a trigger whose bit another register and
+# the selector decide.
+BASE = (
+    '<Float Name="ExposureTimeAbs"><pValue>AbsOf</pValue><Unit>us</Unit></Float>\n'
+    '<Converter Name="AbsOf"><pVariable Name="B">ExposureTimeBaseAbs</pVariable><FormulaTo>FROM / B</FormulaTo>'
+    "<FormulaFrom>TO * B</FormulaFrom><pValue>ExposureTimeRaw</pValue></Converter>\n"
+    + integer("ExposureTimeRaw", 0xA050, "<pMin>RawMin</pMin><pMax>RawMax</pMax>")
+    + register("RawMin", 0xA0A0, "RO")
+    + register("RawMax", 0xA0A4, "RO")
+    + '<Float Name="ExposureTimeBaseAbs"><pValue>BaseOf</pValue><Unit>us</Unit></Float>\n'
+    + '<Converter Name="BaseOf"><pVariable Name="T">Tick_ns</pVariable><FormulaTo>(FROM * 1000) / T</FormulaTo>'
+    + "<FormulaFrom>TO * T / 1000</FormulaFrom><pValue>BaseTicks</pValue></Converter>\n"
+    + register("BaseTicks", 0xA0A8)
+    + register("Tick_ns", 0xA0AC, "RO")
+)
+BIT_OF_SELECTED = (
+    choice("TriggerSelector", 0xB000, {"AcquisitionStart": 0, "FrameStart": 1})
+    + choice("TriggerMode", 0xB004, MODE)
+    + SOURCE
+    + '<Command Name="TriggerSoftware"><pValue>BitOf</pValue><CommandValue>1</CommandValue></Command>\n'
+    + '<IntConverter Name="BitOf"><pVariable Name="I">Implementation</pVariable>'
+    + '<pVariable Name="S">TriggerSelectorReg</pVariable>'
+    + "<FormulaTo>((I = 1) &amp;&amp; (S = 1)) ? ((FROM &lt;&lt; 31) &amp; 0x80000000) : 0</FormulaTo>"
+    + "<FormulaFrom>((I = 1) &amp;&amp; (S = 1)) ? ((TO &amp; 0x80000000) &gt;&gt; 31) : 0</FormulaFrom>"
+    + "<pValue>TriggerBits</pValue></IntConverter>\n"
+    + register("Implementation", 0xB008)
+    + register("TriggerBits", 0xB00C)
+)
+
+
 @dataclass(frozen=True)
 class Dialect:
     """A file's body, settings that it needs, what is used of it (features) or missing from it (a piece of the refusal),
@@ -148,6 +197,8 @@ DIALECTS = {
         temperature="DeviceTemperature",
         settings=(("trigger", "free_run"), ("frame_rate_hz", 10.0)),
     ),
+    "selected": Dialect(STANDARD + SELECTED + EXPOSURE, used="ExposureTime, , FrameStart Software"),
+    "ticks of a clock": Dialect(STANDARD + BIT_OF_SELECTED + BASE, used="ExposureTimeAbs, , FrameStart Software"),
     "whole us": Dialect(
         STANDARD + TRIGGER + integer("ExposureTimeAbs", 0xA050) + integer("CurrentTemperature", 0xA060),
         used="ExposureTimeAbs, , TriggerSoftware",

@@ -7,6 +7,7 @@
     {"do": "faults"}                            -> {"faults": [{"name": S, "worst": V, ...}], "standing": {S: V}}
     {"do": "break", "name": S, "value": V, "for_s": N or null}  -> {"name": S}    as one that was planned
     {"do": "mend", "name": S}                   -> {"name": S}
+    {"do": "unplayed"}                          -> {"camera": [S, ...]}    features of its GenICam file that do not work
     {"do": "quit"}                              -> {}                  the laboratory ends
 
 Anything wrong is answered with {"error": sentence}.
@@ -56,6 +57,8 @@ class Control:
                 return {"now_ns": now_ns}
             case {"do": "state"}:
                 return dict(self._laboratory.state())
+            case {"do": "unplayed"}:
+                return {name: camera.unplayed for name, camera in self._laboratory.cameras.items()}
             case {"do": "quit"}:
                 self._quit()
                 return {}

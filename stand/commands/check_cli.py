@@ -74,7 +74,7 @@ def _rehearse(file: Path, stand: StandConfig | None) -> None:
     found = asyncio.run(rehearse(file, stand))
     lines = [found.camera or str(file), *(f"  {purpose:<14}{name or '-'}" for purpose, name in found.features.items())]
     if found.refusal:
-        lines.append(f"refused: {found.refusal}")
+        lines.append(f"refused: {found.refusal}" if found.is_played else found.refusal)
     show(found, map(one_line, lines))
     if found.refusal:
         raise typer.Exit(FAILED)

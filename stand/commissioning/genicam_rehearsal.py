@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 from drivers.devices.cameras.camera_gige import Camera
 from drivers.devices.cameras.camera_gige import Settings as GigeSettings
+from drivers.wires import camera_dialects as words
 from foundation.clock import WallClock
-from foundation.errors import DeviceError
+from foundation.errors import DeviceError, Unreachable
 from stand.config.simulation import SimulatedCamera
 from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.simulator import Simulator, laboratory_of
+from stand.simulator import ControlSocket, Simulator, laboratory_of
 
 _NAME = "camera"
-
+_SET_BY = (*words.EXPOSURE, *words.EXPOSURE_STEP_US, *words.NECESSARY, "TriggerSoftware")
 
 _ANY = GigeSettings(address="127.0.0.1", exposure_s=0.01)  # some make no longer one without another setting
 
@@ -22,11 +24,15 @@ _ANY = GigeSettings(address="127.0.0.1", exposure_s=0.01)  # some make no longer
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
     """What came of it. camera: vendor and model by the file. features: {"exposure": "ExposureTimeAbs", ...}, what would
-    be used for each purpose, "" for nothing. refusal: why it cannot be used, "" when it opened and gave a frame."""
+    be used for each purpose, "" for nothing. refusal: why it cannot be used, "" when it opened and gave a frame.
+    unplayed: features that no value of their registers makes work here; is_played: False when the refusal is the
+    rehearsal's own, and says nothing of the camera."""
 
     camera: str
     features: dict[str, str]
     refusal: str
+    unplayed: tuple[str, ...] = ()
+    is_played: bool = True
 
 
 async def rehearse(file: Path, stand: StandConfig | None = None) -> Rehearsal:
@@ -42,7 +48,8 @@ async def rehearse(file: Path, stand: StandConfig | None = None) -> Rehearsal:
     # nobody switches it on: without a relay board it has power
     simulator = Simulator({**laboratory, "relays_unit": None, "relay_channels": {}, "camera_boot_s": 0.0})
     try:
-        return await _opened(settings.model_copy(update={"address": simulator.addresses[_NAME]}))
+        unplayed = await _unplayed(simulator)
+        return await _opened(settings.model_copy(update={"address": simulator.addresses[_NAME]}), unplayed)
     finally:
         simulator.stop()
 
@@ -54,7 +61,28 @@ def _settings_of(stand: StandConfig | None) -> GigeSettings:
     return first.model_copy(update={"serial_number": None})
 
 
-async def _opened(settings: GigeSettings) -> Rehearsal:
+async def _unplayed(simulator: Simulator) -> tuple[str, ...]:
+    """The features that the simulated camera cannot play, of those that a camera is set by."""
+    control = ControlSocket(simulator.addresses["control"])
+    await control.open()
+    try:
+        answer = await control.request({"do": "unplayed"})
+    finally:
+        await control.close()
+    return tuple(map(str, cast("list[object]", answer[_NAME])))
+
+
+def _cannot_play(error: DeviceError, unplayed: tuple[str, ...]) -> str:
+    """Why what went wrong is the rehearsal's own, "" when it is the file's. A simulated camera that is understood
+    always gives frames, and takes what its registers can hold."""
+    missed = [name for name in unplayed if name in _SET_BY]
+    if not missed and not isinstance(error, Unreachable):
+        return ""
+    why = f"no value of its registers makes {', '.join(missed)} work" if missed else "it is brought to no frame by it"
+    return f"the rehearsal cannot play this file: {why}; that says nothing of the camera itself ({error.text})"
+
+
+async def _opened(settings: GigeSettings, unplayed: tuple[str, ...]) -> Rehearsal:
     camera = Camera(_NAME, settings, WallClock())
     who = ""
     try:
@@ -64,8 +92,9 @@ async def _opened(settings: GigeSettings) -> Rehearsal:
         frame = await camera.grab()
         took = camera.effective
         size = f"{frame.image.shape[1]} x {frame.image.shape[0]} px, {took.pixel_format}, packets of {took.packet_size}"
-        return Rehearsal(who, {**took.features, "temperature": place, "frame": size}, "")
+        return Rehearsal(who, {**took.features, "temperature": place, "frame": size}, "", unplayed)
     except DeviceError as error:
-        return Rehearsal(who, {}, str(error))
+        own = _cannot_play(error, unplayed)
+        return Rehearsal(who, {}, own or str(error), unplayed, is_played=not own)
     finally:
         await camera.close()

@@ -1,6 +1,7 @@
 """A camera's GenICam file before the camera is there: which features would be used, or which one is missing."""
 
 import json
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,54 @@ async def test_a_file_that_lacks_something_says_what(tmp_path: Path):
     file.write_bytes(DIALECTS["no exposure"].xml("none"))
     reported = await rehearse(file)
     assert "the camera has no ExposureTime" in reported.refusal
+
+
+@pytest.mark.parametrize("dialect", ["selected", "ticks of a clock"])
+async def test_a_file_whose_values_depend_on_registers_of_the_camera_is_played(tmp_path: Path, dialect: str):
+    require_aravis()
+    file = tmp_path / "camera.xml"
+    file.write_bytes(DIALECTS[dialect].xml(dialect))
+    reported = await rehearse(file)
+    assert (reported.refusal, reported.unplayed, reported.is_played) == ("", (), True)
+    assert reported.features["trigger"] == "FrameStart Software"
+
+
+async def test_what_the_rehearsal_cannot_play_is_not_said_of_the_camera(tmp_path: Path):
+    """A formula that no value of its register gives a time; a trigger whose register it does not find."""
+    require_aravis()
+    file, text = tmp_path / "camera.xml", DIALECTS["ticks of a clock"].xml("base").decode()
+    file.write_text(text.replace("<FormulaFrom>TO * T / 1000<", "<FormulaFrom>TO * T * 0<"))
+    reported = await rehearse(file)
+    assert reported.refusal.startswith("the rehearsal cannot play this file: no value of its registers makes Exposure")
+    assert not reported.is_played
+    file.write_text(text.replace("(TO &amp; 0x80000000) &gt;&gt; 31", "0"))
+    reported = await rehearse(file)
+    assert (reported.unplayed, reported.is_played) == (("TriggerSoftware",), False)
+
+
+async def test_the_file_of_a_transport_layers_module_is_refused_by_a_sentence(tmp_path: Path):
+    require_aravis()
+    file, text = tmp_path / "stream.xml", DIALECTS["abs"].xml("stream").decode()
+    width = '<Integer Name="Width"><Value>0x7FFFFFFFFFFFFFFF</Value></Integer>'
+    begin, end = text.index('<Integer Name="Width">'), text.index('<Integer Name="Height">')
+    file.write_text(text[:begin] + width + text[end:])
+    with pytest.raises(ConfigError, match=r"cannot play this file: its Width is 9\.223e\+18.*transport layer's module"):
+        await rehearse(file)
+
+
+async def test_a_zipped_file_is_read(tmp_path: Path):
+    require_aravis()
+    file = tmp_path / "camera.zip"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("abs.xml", DIALECTS["abs"].xml("abs"))
+    assert (await rehearse(file)).refusal == ""
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("readme.txt", "nothing")
+    with pytest.raises(ConfigError, match="an archive with 0 XML files, not one"):
+        await rehearse(file)
+    file.write_bytes(b"PK\x03\x04" + bytes(40))
+    with pytest.raises(ConfigError, match="an archive that cannot be read"):
+        await rehearse(file)
 
 
 async def test_what_is_no_genicam_file_is_refused(tmp_path: Path):

@@ -153,6 +153,11 @@ class FakeCamera:
         return self._sender.counts
 
     @property
+    def unplayed(self) -> tuple[str, ...]:
+        """Features of its GenICam file that no value of their registers makes work."""
+        return self._registers.unplayed if isinstance(self._registers, DressedRegisters) else ()
+
+    @property
     def streaming(self) -> bool:
         """An acquisition is running."""
         return self._schedule.streaming

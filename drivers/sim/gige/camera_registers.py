@@ -106,7 +106,7 @@ class Registers:
             self._store(feature.address, struct.pack(">d", value))
             return
         word = int.from_bytes(self._load(feature.address, feature.length), "big")
-        word = word & ~(_mask(feature) << feature.lsb) | int(value) << feature.lsb
+        word = word & ~(largest(feature) << feature.lsb) | int(value) << feature.lsb
         self._store(feature.address, word.to_bytes(feature.length, "big"))
 
     def covers(self, name: str, address: int, count: int) -> bool:
@@ -186,12 +186,13 @@ class Registers:
         segment[offset : offset + len(data)] = data
 
 
-def _mask(feature: Feature) -> int:
+def largest(feature: Feature) -> int:
+    """All bits of the feature's field."""
     return (1 << (feature.bits or 8 * feature.length)) - 1
 
 
 def _field(feature: Feature, word: int) -> int:
-    return word >> feature.lsb & _mask(feature)
+    return word >> feature.lsb & largest(feature)
 
 
 def _decode(feature: Feature, data: bytes) -> float:

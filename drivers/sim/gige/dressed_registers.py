@@ -11,12 +11,14 @@ from contextlib import suppress
 from dataclasses import replace
 
 from drivers.framing.aravis_library import AravisError
-from drivers.sim.gige.camera_registers import Registers
+from drivers.sim.gige import gvcp
+from drivers.sim.gige.camera_registers import Registers, largest
 from drivers.sim.gige.genicam import Feature
 from drivers.sim.gige.genicam_file import GenicamFile
 from drivers.sim.gige.genicam_memory import Evaluated
 from drivers.sim.gige.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
 from drivers.sim.gige.gvsp import PixelFormat
+from foundation.errors import ConfigError
 
 XML_ADDRESS = 0x7E000000  # no register of the makes known lies there
 _BOOTSTRAP_bytes = 0x1000
@@ -46,6 +48,7 @@ class DressedRegisters(Registers):
         self._file = Evaluated(file)
         self._temperature_degC: float | None = None
         self._commands = {name: self._command(name) for name in COMMANDS if name in file}
+        self.unplayed: tuple[str, ...] = ()  # features that no value of their registers makes work
         super().__init__(dressed, address, serial, file.xml, XML_ADDRESS)
 
     @property
@@ -62,14 +65,14 @@ class DressedRegisters(Registers):
         """Every feature to its default, as after power-on."""
         super().reset()
         self._file.memory.restore({})
-        start_values(self._file, self.integer("WidthMax"), self.integer("HeightMax"))
+        self.unplayed = start_values(self._file, self.integer("WidthMax"), self.integer("HeightMax"))
         self._temperature_degC = None
         self._wear()
         self.put("PayloadSize", self.integer("Width") * self.integer("Height"))
 
     def put(self, name: str, value: float) -> None:
         """Set a feature from inside: no access rules. What the client may read shows it, too."""
-        super().put(name, value)
+        self._put_own(name, value)
         if name == "PayloadSize" and name in self._file.file:
             sizes = {register for each in ("Width", "Height") for register in self._file.file.registers(each)}
             reach(self._file, name, value, sizes)
@@ -78,6 +81,16 @@ class DressedRegisters(Registers):
             for feature in TEMPERATURES:
                 if feature in self._file.file:
                     reach(self._file, feature, value)
+
+    def _put_own(self, name: str, value: float) -> None:
+        """ConfigError when it does not fit: the file is not of a camera."""
+        feature = self._table[name]
+        if feature.kind != "float" and not 0 <= value <= largest(feature):
+            raise ConfigError(
+                f"the rehearsal cannot play this file: its {name} is {value:.4g}, as no camera's; is it the file of a "
+                "transport layer's module (system, interface, device, data stream), not of a camera?"
+            )
+        super().put(name, value)
 
     def covers(self, name: str, address: int, count: int) -> bool:
         """Whether a read of `count` bytes at `address` touches the feature's register."""
@@ -98,30 +111,36 @@ class DressedRegisters(Registers):
         if address in self._at and address < _BOOTSTRAP_bytes:
             return super().write(address, data)
         self._file.memory.write(address, data)
-        given = [name for name in self._commands if self._was_given(name, address, len(data))]
-        for name in given:  # they clear themselves
-            register, value = self._commands[name]
-            if value:
+        given = {name: self._given_by(name, address, len(data)) for name in self._commands}
+        for name, register in given.items():  # they clear themselves
+            if register and self._commands[name][2]:
                 self._file.set(register, 0)
-        return (*self._wear(), *given)
+        try:
+            changed = self._wear()
+        except ConfigError as error:
+            raise gvcp.Nack(gvcp.Status.BAD_PARAMETER, str(error)) from error
+        return (*changed, *(name for name, register in given.items() if register))
 
     # ---------------------------------------------------------------------------------------------------- the clothes
 
     def _registers_of(self, feature: str) -> tuple[str, ...]:
         return self._file.file.registers(feature) if feature in self._file.file else ()
 
-    def _command(self, name: str) -> tuple[str, int]:
-        """The register that a command writes, "" for none, and the value."""
-        registers = self._file.file.registers(name)
-        return (registers[0] if registers else "", self._file.command_value(name))
+    def _command(self, name: str) -> tuple[str, tuple[str, ...], int]:
+        """The node that a command gives its value, the registers that this may write, and the value. Which register it
+        is a selector may say that only the client knows (Basler ace 2)."""
+        file = self._file.file
+        return file.named(name, "pValue"), file.written(name), self._file.command_value(name)
 
-    def _was_given(self, name: str, address: int, count: int) -> bool:
-        """Whether that write was the command; start and stop may be values of one register."""
-        register, value = self._commands[name]
-        if not register:
-            return False
-        begin, length = self._file.place(register)
-        return address < begin + length and begin < address + count and self._file.get(register) == value
+    def _given_by(self, name: str, address: int, count: int) -> str:
+        """The register by which that write was the command, "" when it was not; start and stop may be values of one."""
+        node, registers, value = self._commands[name]
+        for register in registers:
+            begin, length = self._file.place(register)
+            is_touched = address < begin + length and begin < address + count
+            if is_touched and value in (self._file.get(register), self._file.get(node)):
+                return register
+        return ""
 
     def _wear(self) -> tuple[str, ...]:
         """Set the camera behind to what the file's features are now; the names of those that changed."""
@@ -129,7 +148,7 @@ class DressedRegisters(Registers):
         for name, value in self._worn().items():
             known = self._value(self._table[name])
             if value != known:
-                super().put(name, value)
+                self._put_own(name, value)
                 changed.append(name)
         return tuple(changed)
 

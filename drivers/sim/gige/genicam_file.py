@@ -5,17 +5,22 @@ Only the structure is read here; values, converters and SwissKnives are evaluate
 
 from __future__ import annotations
 
+import io
 import xml.etree.ElementTree as ET
+import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 from foundation.errors import ConfigError
 
 LARGEST_bytes = 16 << 20  # ten times the largest of 27 makes and models
+_ZIP = b"PK\x03\x04"
 REGISTERS = frozenset({"IntReg", "MaskedIntReg", "FloatReg", "StructEntry"})
 
 # What a node's value follows from: its own value, and the variables of a formula.
-_MADE_OF = frozenset({"pValue", "pVariable", "pValueIndexed", "pValueDefault"})
+_WRITTEN = frozenset({"pValue", "pValueIndexed", "pValueDefault"})
+_MADE_OF = _WRITTEN | {"pVariable"}
 _NOT_A_NODE = frozenset({"EnumEntry", "pVariable", "Constant", "Expression"})
 
 
@@ -63,13 +68,17 @@ class GenicamFile:
         """The registers that a node's value is made of, nearest first."""
         return tuple(each for each in self.reached(name) if self.kind(each) in REGISTERS)
 
-    def reached(self, name: str) -> list[str]:
+    def written(self, name: str) -> tuple[str, ...]:
+        """The registers that writing a node may write: which one a selector says."""
+        return tuple(each for each in self.reached(name, _WRITTEN) if self.kind(each) in REGISTERS)
+
+    def reached(self, name: str, properties: frozenset[str] = _MADE_OF) -> list[str]:
         """The node, and all that its value is made of, nearest first."""
         reached = [name]
         for each in reached:
             for child in self._nodes[each]:
                 target = (child.text or "").strip()
-                if _tag(child) in _MADE_OF and target in self._nodes and target not in reached:
+                if _tag(child) in properties and target in self._nodes and target not in reached:
                     reached.append(target)
         return reached
 
@@ -83,7 +92,21 @@ def read_genicam(path: Path) -> GenicamFile:
         raise ConfigError(f"the GenICam file {path} cannot be read: {error.strerror}") from error
     if len(text) > LARGEST_bytes:
         raise ConfigError(f"{path} is no GenICam file: it has more than {LARGEST_bytes >> 20} MB")
-    return GenicamFile(text, str(path))
+    return GenicamFile(_unzipped(text, path) if text.startswith(_ZIP) else text, str(path))
+
+
+def _unzipped(data: bytes, path: Path) -> bytes:
+    """The XML file in an archive, as many cameras hold theirs."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            files = [each for each in archive.infolist() if each.filename.lower().endswith(".xml")]
+            if len(files) != 1:
+                raise ConfigError(f"{path} is no GenICam file: an archive with {len(files)} XML files, not one")
+            if files[0].file_size > LARGEST_bytes:
+                raise ConfigError(f"{path} is no GenICam file: it has more than {LARGEST_bytes >> 20} MB")
+            return archive.read(files[0])
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
+        raise ConfigError(f"{path} is no GenICam file: an archive that cannot be read ({error})") from error
 
 
 def _tag(element: ET.Element) -> str:

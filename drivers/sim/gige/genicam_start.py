@@ -53,16 +53,18 @@ _NEAR, _NEAR_ENOUGH = 1e-3, 0.03  # of a value; the second where a register has 
 _ALL_BITS = 2**32 - 1
 _LARGEST_RAW = float(2**31 - 1)  # of a register with a sign
 _BISECTIONS = 40
-_A_DIVISOR = 1e6  # as a clock's ticks in a second
+_FILLERS = (1.0, 1e6)  # of a register that a formula multiplies by, or divides by, as a clock's ticks in a second
 
 
-def start_values(camera: Evaluated, width: int, height: int) -> None:
+def start_values(camera: Evaluated, width: int, height: int) -> tuple[str, ...]:
     """Put them into the camera's memory: everything known is there, the sensor has width x height px unless the file
-    fixes another size."""
+    fixes another size. The features that stay at 0, or cannot be evaluated, whatever their registers hold."""
     for names in ((*ENTRIES, *COMMANDS, *WISHES), *[(*ENTRIES, *WISHES)] * 2):  # some are there with a trigger only
         _choose_entries(camera)  # selectors say which registers count
         for condition in dict.fromkeys(_conditions(camera, names)):
             _make_true(camera, condition)
+        for command in COMMANDS:
+            _make_effective(camera, command)
     spared = {register for name in WISHES if name in camera.file for register in camera.file.registers(name)}
     sides = {"Width": float(width), "Height": float(height)}
     for name, (value, lowest, highest, step) in WISHES.items():
@@ -78,6 +80,37 @@ def start_values(camera: Evaluated, width: int, height: int) -> None:
         if value is None and (fixed := _got(camera, name) or 0.0) > 0:
             sides[axis] = min(sides[axis], fixed)
     _choose_entries(camera)
+    wished = [name for name, (value, *_) in WISHES.items() if value != 0 and name in camera.file]
+    mute = [name for name in COMMANDS if name in camera.file and not _make_effective(camera, name)]
+    return (*(name for name in wished if camera.file.registers(name) and not _got(camera, name)), *mute)
+
+
+def _make_effective(camera: Evaluated, command: str) -> bool:
+    """Have a command change what it writes, by one of the registers that its formula looks at; whether it does."""
+    node = camera.file.named(command, "pValue") if command in camera.file else ""
+    if node not in camera.file:
+        return True
+    value, looked_at = camera.command_value(command), set(camera.file.registers(node)) - {*camera.file.written(node)}
+    if value == 0 or _is_taken(camera, node, value):
+        return True
+    for register in looked_at:
+        before = _got(camera, register) or 0.0
+        for tried in (1.0, 0.0):
+            _quietly(camera.set, register, tried)
+            if _is_taken(camera, node, value):
+                return True
+        _quietly(camera.set, register, before)
+    return False
+
+
+def _is_taken(camera: Evaluated, node: str, value: float) -> bool:
+    """Whether a node shows what is written to it; its registers are then as before."""
+    before = {register: _got(camera, register) for register in camera.file.written(node)}
+    _quietly(camera.set, node, value)
+    is_taken = _got(camera, node) == value
+    for register, was in before.items():
+        _quietly(camera.set, register, was or 0.0)
+    return is_taken
 
 
 def _limits(camera: Evaluated, name: str, wanted: tuple[float | None, float | None, float]) -> Iterator[Limit]:
@@ -116,11 +149,14 @@ def reach(camera: Evaluated, name: str, value: float, spared: Collection[str] = 
         return True
     if any(_tried(camera, name, register, value) for register in own):
         return True
-    for register in own:  # a formula may divide by one that is zero
-        if _got(camera, register) == 0:
-            _quietly(camera.set, register, _A_DIVISOR)
-    _quietly(camera.set, name, value)
-    return _is(camera, name, value) or any(_tried(camera, name, register, value) for register in own)
+    unset = [register for register in own if _got(camera, register) == 0]
+    for filler in _FILLERS if unset else ():
+        for register in unset:
+            _quietly(camera.set, register, filler)
+        _quietly(camera.set, name, value)
+        if _is(camera, name, value) or any(_tried(camera, name, register, value) for register in own):
+            return True
+    return False
 
 
 def _tried(camera: Evaluated, name: str, register: str, value: float) -> bool:
