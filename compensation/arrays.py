@@ -17,6 +17,7 @@ from markers.target import Target
 from recording.reading.interpolation import interpolated
 
 _SPACING_mm = 1.0
+_ROUNDING = 1e-9
 
 
 def observations_of(
@@ -91,7 +92,8 @@ def _covariance(covariance_px2: ArrayLike | None, sigma_px: float, missing: NDAr
         raise ValueError(f"covariance_px2 has shape {given.shape}, not {shape} or, one for all, (2, 2)")
     whole = np.broadcast_to(given, shape)
     xx, xy, yx, yy = whole.reshape(-1, 4).T
-    sound = ((xx > 0) & (yy > 0) & (xx * yy > xy**2) & (xy == yx) & np.isfinite(xx + yy)).reshape(missing.shape)
+    symmetric = np.abs(xy - yx) <= _ROUNDING * np.abs(xx + yy)  # a fit's own is so to rounding
+    sound = ((xx > 0) & (yy > 0) & (xx * yy > xy**2) & symmetric & np.isfinite(xx + yy)).reshape(missing.shape)
     if wrong := np.argwhere(~missing & ~sound).tolist():
         frame, marker = wrong[0]
         raise ValueError(
