@@ -17,7 +17,7 @@ from foundation.items import Event
 from stand.chamber.permits import Permission, Permits
 from stand.fault import value_of
 
-_SUPERVISED_S = 2.5  # between looks at relays and regulator while nothing is permitted: off again within 5 s
+SUPERVISED_S = 2.5  # between looks at relays and regulator while nothing is permitted: off again within 5 s
 
 
 @dataclass
@@ -47,7 +47,7 @@ class Keeper:
                 if self._kept_by != kept_by:
                     self._kept_by = kept_by
                     self._tell("permit_not_renewed", f"heating and cooling permits not renewed: {error}")
-            period_s = self.renew_s if self.permits.granted else min(self.renew_s, _SUPERVISED_S)
+            period_s = self.renew_s if self.permits.granted else min(self.renew_s, SUPERVISED_S)
             due_ns = max(due_ns + seconds_ns(period_s), self.clock.now_ns())
             await self.clock.sleep_until(due_ns)
 

@@ -20,7 +20,7 @@ from stand.guarding.met_errors import MetErrors
 from stand.guarding.notify import Notifier
 from stand.safety import Safety
 
-_LATE_PERIODS = 2
+LATE_PERIODS = 2
 _STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stopped is read within this after it continues
 _ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more often needs an operator
 
@@ -90,7 +90,7 @@ class Guard:
         readings."""
         if self._ended or self.held is not None or self._looked_ns is None:
             return False
-        if self.clock.now_ns() - self._looked_ns > _LATE_PERIODS * seconds_ns(self.period_s):
+        if self.clock.now_ns() - self._looked_ns > LATE_PERIODS * seconds_ns(self.period_s):
             return False
         good_ns = [self.hub.last_good_ns(channel) for channel in self.vital]
         return all(time_ns is not None and time_ns >= self._fresh_after_ns for time_ns in good_ns)
@@ -98,7 +98,7 @@ class Guard:
     @property
     def is_on_time(self) -> bool:
         """Whether it looks as often as it must."""
-        now_ns, late_ns = self.clock.now_ns(), _LATE_PERIODS * seconds_ns(self.period_s)
+        now_ns, late_ns = self.clock.now_ns(), LATE_PERIODS * seconds_ns(self.period_s)
         return not self._ended and self._looked_ns is not None and now_ns - self._looked_ns <= late_ns
 
     def clear(self) -> Fault | None:
@@ -213,7 +213,7 @@ class Guard:
         """Lateness counts from the last look: any cause of a delay counts, also a stopped process."""
         now_ns = self.clock.now_ns()
         looked_ns, self._looked_ns = self._looked_ns, now_ns
-        if looked_ns is None or now_ns - looked_ns <= _LATE_PERIODS * seconds_ns(self.period_s):
+        if looked_ns is None or now_ns - looked_ns <= LATE_PERIODS * seconds_ns(self.period_s):
             return
         self._late_ns, self._fresh_after_ns = now_ns, now_ns + seconds_ns(_STRADDLING_S)
         gap_s = (now_ns - looked_ns) / NS_PER_S
