@@ -37,6 +37,7 @@ test: setup
 nightly: setup
 	@sh .ci/system-packages $(PEER_PACKAGES)
 	$(BIN)/pytest -m "nightly or hypothesis" --hypothesis-profile=night -o faulthandler_timeout=5400
+	$(BIN)/python -m tests.torture --minutes 30 --jobs $(shell nproc) --shrink 40
 
 bench: setup
 	$(BIN)/python -m tests.bench

@@ -183,11 +183,14 @@ def list_faults() -> list[dict[str, object]]:
 
 
 class Simulator:
-    """A running simulator process; `addresses` says where each device and the control socket answers."""
+    """A running simulator process; `addresses` says where each device and the control socket answers. module: what
+    simulates; tests have one that also writes down what truly happens."""
+
+    module = "drivers.sim"
 
     def __init__(self, laboratory: Mapping[str, object]) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "drivers.sim"],
+            [sys.executable, "-m", self.module],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -31,6 +31,7 @@ _INTERFACE = ("stand.serving.api.app", "stand.serving.api.listening", "stand.ser
 """Modules that a daemon imports when it begins to answer."""
 _LOADED = {
     "stand.cli": ("stand.commands.run_cli", "stand.commands.serve_cli", "stand.commands.queue_cli", *_INTERFACE),
+    "tests.torture.product": ("stand.commands.run_cli", *_INTERFACE),
     "tests.code": ("stand.running.run", "stand.queueing.queue_work", "stand.serving.api.server", *_INTERFACE),
     "recording.writing.disk": ("recording.writing.recorder", "stand.queueing.queue_work"),
     "stand.serving.preview_process": ("stand.serving.preview", "stand.serving.recorded_drift"),
@@ -80,6 +81,17 @@ class Programs:
 
     PIPE, DEVNULL, TimeoutExpired = subprocess.PIPE, subprocess.DEVNULL, subprocess.TimeoutExpired
     Popen, run = staticmethod(popen), staticmethod(subprocess.run)
+
+
+def be_served(address: str) -> None:
+    """Programs of this process, too, are forked by the one that answers there; "" for none."""
+    global _address
+    _address = address
+
+
+def served_at() -> str:
+    """Where the process that forks answers; "" where there is none."""
+    return _address
 
 
 def is_served() -> bool:

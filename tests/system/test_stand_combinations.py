@@ -192,9 +192,8 @@ def pairwise() -> Iterator[Combination]:
 
 
 COMBINATIONS = tuple(pairwise())
-RUN_BY_NIGHT = tuple(
-    each for each in COMBINATIONS if each[0].name not in {"eurotherm-3200", "watlow-ez-zone", "watlow-f4t"}
-)
+NOT_SIMULATED = {"eurotherm-3200", "watlow-ez-zone", "watlow-f4t"}
+RUN_BY_NIGHT = tuple(each for each in COMBINATIONS if each[0].name not in NOT_SIMULATED)
 
 
 def named(combination: Combination) -> str:

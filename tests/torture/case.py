@@ -1,0 +1,301 @@
+"""A case of the torture rig: a stand, a plan, faults, orders and kills. Drawn from a seed, or read from a YAML."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drivers.sim.laboratory_faults import FAULTS
+
+START_NS = 1_767_290_400_000_000_000  # 2026-01-01 18:00 UTC, as the installed simulated stand has it
+MOST_FAULTS, MOST_ORDERS, MOST_KILLS = 8, 6, 3
+LEFT_OUT = 0.5  # of the kinds, in each seed: what one kind hides of another shows then
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One of the simulator's (`stand simulate --faults`), from at_s after the begin on, for for_s."""
+
+    name: str
+    value: Any
+    at_s: float
+    for_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What somebody does at at_s: `verb` is one of ORDERS."""
+
+    verb: str
+    at_s: float
+    body: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """stand: the choice at each place of tests.system.test_stand_combinations.PLACES. plan: a recipe's steps or
+    experiments. kills_s: when the program is killed; each time its run is resumed. drawn_order: sleepers with one
+    deadline, and tasks ready at one wake, run in an order drawn from the seed."""
+
+    seed: int
+    stand: dict[str, str]
+    plan: dict[str, list[Any]]
+    chamber_seed: int | None = None
+    laboratory_degC: float = 24.0
+    attended: bool = False
+    drawn_order: bool = True
+    faults: tuple[Fault, ...] = ()
+    orders: tuple[Order, ...] = ()
+    kills_s: tuple[float, ...] = ()
+
+    @property
+    def start_ns(self) -> int:
+        """The instant from which its seconds count."""
+        return START_NS
+
+
+PLAIN = {
+    "heat": "omron-e5cc",
+    "relays": "waveshare",
+    "flap": "flap",
+    "axes": "two axes",
+    "thermometers": "5",
+    "cameras": "1 camera",
+    "beside": "alone",
+}
+
+
+def steps_of(plan: dict[str, list[Any]]) -> int:
+    """How many entries a plan has."""
+    return sum(map(len, plan.values()))
+
+
+def write_case(case: Case) -> str:
+    """As YAML."""
+    return yaml.safe_dump(json.loads(json.dumps(asdict(case))), sort_keys=False, width=120)
+
+
+def read_case(path: Path) -> Case:
+    """From YAML."""
+    data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    data["faults"] = tuple(Fault(**each) for each in data.get("faults", ()))
+    data["orders"] = tuple(Order(**each) for each in data.get("orders", ()))
+    data["kills_s"] = tuple(data.get("kills_s", ()))
+    return Case(**data)
+
+
+CHAMBERS = ("espec", "cts", "ascii2", "simserv", "julabo")
+# Which faults a stand can have: by the beginning of their name, whether it has that.
+_HAS: dict[str, Callable[[dict[str, str]], bool]] = {
+    "bus": lambda stand: True,
+    "heater": lambda stand: True,
+    "chamber": lambda stand: stand["heat"] in CHAMBERS,
+    "regulator": lambda stand: stand["heat"] == "omron-e5cc",
+    "heat_module": lambda stand: stand["heat"] == "heat module",
+    "relays": lambda stand: stand["heat"] not in CHAMBERS or stand["relays"] != "no board",
+    "inputs": lambda stand: stand["beside"] != "alone",
+    "imager": lambda stand: stand["beside"] != "alone",
+    "flap": lambda stand: stand["flap"] == "flap",
+    "camera": lambda stand: stand["cameras"] != "no camera",
+    "axis": lambda stand: stand["axes"] != "no axes",
+    "linear": lambda stand: stand["axes"] != "no axes",
+    "rotary": lambda stand: stand["axes"] != "no axes",
+    "thermometer": lambda stand: stand["thermometers"] != "16",
+    "thermometers": lambda stand: stand["thermometers"] != "16",
+}
+# What happens in real time on a wire or at a camera races with the program: such a seed would not repeat.
+_RACES = {
+    "delay_s",
+    "late",
+    "late_s",
+    "mixed",
+    "pending",
+    "stretch_s",
+    "leader_early_s",
+    "unpaced",
+    "reordered",
+    "loss",
+}
+RACES = {name for name in FAULTS if name.partition(".")[2] in _RACES} | {
+    "camera.truncated",
+    "camera.burst",
+    "flap.timeout",
+}
+KINDS = {name: fault.worst for name, fault in sorted(FAULTS.items()) if name not in RACES}
+"""The faults of virtual time, and how bad each is at worst: a new one of the simulator's is drawn by itself."""
+# A contact that always conducts, or a board without its timer, leaves nothing that software could cut: one at a time,
+# and not together with a heater that conducts by itself. The hard-wired cut-out is for that.
+BEYOND = ("relays.welded", "relays.no_timer", "relays.no_rearm", "relays.lost_writes", "heater.welded_share")
+_TIMES_OUT = ("silent", "unplugged", "mute", "silent_s", "swallows_first", "compoway", "hangs_up")
+_NAMES = {"5": ("air", "granite_inside", "granite_outside", "artifact", "laboratory"), "2": ("air", "granite_inside")}
+ORDERS = (
+    *("pause", "continue", "clear", "stop", "note", "skip", "extend", "interrupt", "state"),
+    *("switch_on", "switch_off"),
+)
+"""The operator's commands over HTTP, two signals, a second client's look, and a second master that writes coils."""
+
+
+def draw(seed: int) -> Case:
+    """The case of a seed."""
+    drawn = random.Random(seed)
+    stand = _stand(drawn)
+    plan, duration_s = _plan(drawn, stand)
+    left = {kind for kind in (*KINDS, *ORDERS, "kill") if drawn.random() >= LEFT_OUT}
+    return Case(
+        seed,
+        stand,
+        plan,
+        chamber_seed=drawn.choice((None, drawn.randrange(1000))),
+        laboratory_degC=drawn.choice((24.0, 18.0, 30.0)),
+        attended=drawn.random() < 0.3,
+        faults=tuple(_faults(drawn, stand, left, duration_s)),
+        orders=tuple(_orders(drawn, left, duration_s)),
+        kills_s=_kills(drawn, left, duration_s),
+    )
+
+
+def _stand(drawn: random.Random) -> dict[str, str]:
+    from tests.system.test_stand_combinations import NOT_SIMULATED, PLACES
+
+    names = {place: [each.name for each in choices] for place, choices in PLACES.items()}
+    names["heat"] = [name for name in names["heat"] if name not in NOT_SIMULATED]
+    return {place: drawn.choice((PLAIN[place], drawn.choice(names[place]))) for place in PLACES}
+
+
+def _plan(drawn: random.Random, stand: dict[str, str]) -> tuple[dict[str, list[Any]], float]:
+    """A recipe, and about how long it takes, s."""
+    low = 12 if stand["relays"] != "no compressor" or stand["heat"] in CHAMBERS else 26
+    has_table, has_camera = stand["axes"] == "two axes", stand["cameras"] != "no camera"
+    if has_table and has_camera and drawn.random() < 0.25:
+        dwell_s = drawn.choice((300, 600, 900))
+        if drawn.random() < 0.5:
+            grid = {"linear_mm": [0, 40], "rotary_deg": [-5, 5], "frames_per_position": 1, "equilibrium_s": dwell_s}
+            return {"experiments": [{"calibration": grid}]}, 900.0 + dwell_s
+        spots = [{"linear_mm": 0, "rotary_deg": 0}, {"linear_mm": 40, "rotary_deg": 5}]
+        points = {"temperatures_degC": [24, drawn.randrange(low, 42) + 0.5], "positions": spots, "dwell_s": dwell_s}
+        points |= {"equilibrium_s": dwell_s, "reference_frames": 1, "frames_per_position": 1}
+        return {"experiments": [{"validation": points}]}, 1500.0 + 2 * dwell_s
+    steps: list[Any] = ["close_flap", {"start_chamber": 26}, {"soak": drawn.choice((120, 600))}]
+    duration_s = 700.0
+    for _ in range(drawn.randint(1, 4)):
+        soak_s = drawn.choice((120, 600, 1800, 3000))
+        settles = has_camera and soak_s >= 1800 and drawn.random() < 0.5
+        steps += [{"set_temperature": drawn.randrange(low, 46)}]
+        steps += [{"soak_until_settled": {"max_s": soak_s}} if settles else {"soak": soak_s}]
+        if has_table and drawn.random() < 0.5:
+            steps += [{"move_to": {"linear": drawn.choice((0, 20, 60)), "rotary": drawn.choice((-5, 0, 5))}}]
+        interval_s, role = drawn.choice((1, 20)), drawn.choice(("fit", "other"))
+        capture = {"capture": {"frames": drawn.randint(1, 3), "interval_s": interval_s, "role": role}}
+        steps += ["open_flap", capture if has_camera else {"soak": 30}, "close_flap"]
+        steps += [{"prompt": "turn the target"}] if drawn.random() < 0.2 else []
+        duration_s += soak_s + 120.0
+    return {"steps": [*steps, "stop_chamber"]}, duration_s
+
+
+def _faults(drawn: random.Random, stand: dict[str, str], left: set[str], duration_s: float) -> Iterator[Fault]:
+    names = [name for name in KINDS if name in left and _HAS[name.partition(".")[0]](stand)]
+    is_beyond = False
+    for name in drawn.choices(names, k=drawn.randrange(MOST_FAULTS + 1)) if names else ():
+        if name in BEYOND and is_beyond:
+            continue
+        is_beyond = is_beyond or name in BEYOND
+        for_s = drawn.choice((5.0, 20.0, 60.0, 300.0, 1800.0))
+        if name.partition(".")[2] in _TIMES_OUT:
+            for_s = min(for_s, 20.0)  # each time-out takes real time
+        yield Fault(name, _value(drawn, name, stand), round(drawn.uniform(0.0, duration_s), 1), for_s)
+
+
+def _value(drawn: random.Random, name: str, stand: dict[str, str]) -> Any:
+    worst, names = KINDS[name], _NAMES.get(stand["thermometers"], ("air",))
+    match name:
+        case "inputs.changed":
+            return "door"
+        case "axis.alarm":
+            return drawn.choice(("linear", "rotary"))
+        case "relays.welded":
+            return drawn.choice(("heater_enable", "compressor")[: 1 + (stand["relays"] != "no compressor")])
+        case "heater.welded_share":
+            return drawn.choice((0.1, 0.3, 1.0))
+        case _ if isinstance(worst, dict):
+            share = drawn.choice((1.0, 0.3, -1.0))
+            return {drawn.choice(names): 24.0 if name.endswith("_degC") else share * float(*worst.values())}
+        case _ if name.startswith("thermometer."):
+            return drawn.choice(names)
+        case _ if isinstance(worst, float):
+            return round(worst * drawn.choice((1.0, 0.5)), 3)
+        case _:
+            return copy.deepcopy(list(worst) if isinstance(worst, tuple) else worst)
+
+
+def _orders(drawn: random.Random, left: set[str], duration_s: float) -> Iterator[Order]:
+    verbs = [verb for verb in ORDERS if verb in left]
+    if not verbs or drawn.random() < 0.4:
+        return
+    for verb in drawn.choices(verbs, k=drawn.randint(1, MOST_ORDERS)):
+        at_s = round(drawn.uniform(0.0, duration_s), 1)
+        yield Order(verb, at_s, {"relay": drawn.choice((0, 1, 3))} if verb.startswith("switch") else {})
+        if verb == "pause":
+            yield Order("continue", round(at_s + drawn.choice((10.0, 300.0, 1200.0)), 1))
+
+
+def _kills(drawn: random.Random, left: set[str], duration_s: float) -> tuple[float, ...]:
+    if "kill" not in left or drawn.random() < 0.5:
+        return ()
+    return tuple(sorted(round(drawn.uniform(0.0, duration_s), 2) for _ in range(drawn.randint(1, MOST_KILLS))))
+
+
+def stand_document(case: Case, folder: Path) -> dict[str, Any]:
+    """The stand's file; what it needs beside it is written to `folder`."""
+    from tests.system.test_stand_combinations import PLACES, written
+
+    parts = [next(each for each in PLACES[place] if each.name == name) for place, name in case.stand.items()]
+    data = written(tuple(parts), folder)
+    data["bus"] |= {"timeout_s": 0.05}  # real time, of which a silent unit takes most
+    for device in (data.get("climate_chamber", {}), *data.get("probes", {}).values()):
+        device |= {"timeout_s": 0.1}
+    laboratory = {"chamber_seed": case.chamber_seed, "laboratory_degC": case.laboratory_degC, "seed": case.seed}
+    data["simulation"] |= laboratory
+    if "imager" in data:
+        data["imager"]["folder"] = str(folder / "pictures")
+    return data
+
+
+def smaller(case: Case) -> Iterator[Case]:
+    """What a failing case could be instead, the boldest first."""
+    for name in ("faults", "orders", "kills_s"):
+        whole = getattr(case, name)
+        half = len(whole) // 2
+        parts = [(), whole[:half], whole[half:]] if half else [()] if whole else []
+        for part in parts:
+            yield replace(case, **{name: part})
+        for number in range(len(whole) if half else 0):
+            yield replace(case, **{name: (*whole[:number], *whole[number + 1 :])})
+    for name, plain in (("drawn_order", False), ("chamber_seed", None), ("attended", False), ("laboratory_degC", 24.0)):
+        if getattr(case, name) != plain:
+            yield replace(case, **{name: plain})
+    for place, choice in case.stand.items():
+        if choice != PLAIN[place]:
+            yield replace(case, stand={**case.stand, place: PLAIN[place]})
+    for plan in _shorter(case.plan.get("steps", [])):
+        yield replace(case, plan=plan)
+    for number, fault in enumerate(case.faults):
+        if fault.for_s > 5.0:
+            shorter = replace(fault, for_s=round(fault.for_s / 2, 1))
+            yield replace(case, faults=(*case.faults[:number], shorter, *case.faults[number + 1 :]))
+
+
+def _shorter(steps: list[Any]) -> Iterable[dict[str, list[Any]]]:
+    """The plan without a half of its middle, then without one step of it."""
+    middle = len(steps) // 2
+    for first, last in ((3, middle), (middle, len(steps) - 1)):
+        if 0 < last - first < len(steps) - 4:
+            yield {"steps": [*steps[:first], *steps[last:]]}
+    for number in range(1, len(steps) - 1):
+        yield {"steps": [*steps[:number], *steps[number + 1 :]]}

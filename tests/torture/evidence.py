@@ -1,0 +1,190 @@
+"""What an observer from outside has of a case: the plant's truth, the bytes on the wires, the disk, what HTTP said, and
+how each life ended. Nothing of the guard, the recorder or the reader gets it: MCAP files are read by the mcap package.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from tests.torture.case import Case
+from tests.torture.laboratory import TRUTH
+from tests.torture.lives import COMPLETE, KILLED, Life
+
+ROW = np.dtype([("time_ns", "<i8"), *((name, "<f8") for name in TRUTH)])
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """An event of the recording."""
+
+    time_ns: int
+    level: str
+    kind: str
+    text: str
+    data: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A step of the plan as the recording has it."""
+
+    time_ns: int
+    step_id: str
+    kind: str
+    state: str
+    parameters: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """A Modbus request on the bus, and whether a whole answer to it left the unit."""
+
+    time_ns: int
+    unit: int
+    function: int
+    address: int
+    value: int
+    is_answered: bool
+
+
+@dataclass
+class Evidence:
+    """frames: how often each (topic, instant) is there. metas: (instant, channel, step id) of the descriptions.
+    temperatures: (instant, degC, quality) by the thermometer's name. Instants are ns."""
+
+    case: Case
+    folder: Path
+    lives: Sequence[Life]
+    unreadable: list[str] = field(default_factory=list)
+    said: list[Said] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
+    frames: Counter[tuple[str, int]] = field(default_factory=Counter)
+    metas: list[tuple[int, str, str]] = field(default_factory=list)
+    temperatures: dict[str, list[tuple[int, float, str]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.stand = yaml.safe_load((self.folder / "stand.yaml").read_text())
+        self.session = next(iter(sorted((self.folder / "out").glob("*/journal.jsonl"))), self.folder / "none/x").parent
+        for path in sorted(self.session.glob("*/*.mcap*")):
+            if path.suffix in (".mcap", ".part"):
+                self._read(path)
+
+    def at_s(self, time_ns: int) -> float:
+        """An instant in s since the case's begin."""
+        return round((time_ns - self.case.start_ns) / 1e9, 2)
+
+    @cached_property
+    def truth(self) -> list[np.ndarray]:
+        """The plant at each of its steps, one array a life."""
+        paths = [self.folder / f"truth-{number}.bin" for number in range(len(self.lives))]
+        found = [path.read_bytes() if path.exists() else b"" for path in paths]
+        return [np.frombuffer(data[: len(data) // ROW.itemsize * ROW.itemsize], ROW) for data in found]
+
+    def true_at(self, time_ns: int) -> np.void | None:
+        """The plant at an instant: that of the last life begun by then, as each has a laboratory of its own."""
+        for truth in reversed(self.truth):
+            if len(truth) and truth["time_ns"][0] <= time_ns:
+                place = int(np.searchsorted(truth["time_ns"], time_ns, side="right")) - 1
+                return truth[place] if time_ns <= truth["time_ns"][-1] + int(1e9) else None
+        return None
+
+    @cached_property
+    def bus(self) -> list[list[Exchange]]:
+        """What was said on the bus, one list a life."""
+        return [list(self._bus(number)) for number in range(len(self.lives))]
+
+    @cached_property
+    def doors(self) -> list[list[dict[str, Any]]]:
+        """What people did and were answered, one list a life."""
+        paths = [self.folder / f"doors-{number}.jsonl" for number in range(len(self.lives))]
+        return [[json.loads(line) for line in path.read_text().splitlines()] if path.exists() else [] for path in paths]
+
+    @cached_property
+    def journal(self) -> list[dict[str, Any]]:
+        """The entries of the journal: a checksum and a JSON a line."""
+        path, found = self.session / "journal.jsonl", []
+        for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
+            try:
+                found.append(json.loads(line.partition(" ")[2]))
+            except ValueError:
+                continue
+        return found
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the last life ended with its plan."""
+        return bool(self.lives) and self.lives[-1].status == COMPLETE
+
+    @property
+    def killed(self) -> int:
+        """How many lives were."""
+        return sum(life.status == KILLED for life in self.lives)
+
+    def excused(self, at_s: float, *names: str, after_s: float = 0.0) -> bool:
+        """Whether a fault whose name begins so stood then, or not after_s before."""
+        return any(
+            each.at_s <= at_s <= each.at_s + each.for_s + after_s
+            for each in self.case.faults
+            if each.name.startswith(names)
+        )
+
+    def ordered(self, at_s: float, verb: str, within_s: float) -> bool:
+        """Whether somebody did that not within_s before."""
+        return any(each.verb == verb and 0 <= at_s - each.at_s <= within_s for each in self.case.orders)
+
+    def _bus(self, number: int) -> Iterator[Exchange]:
+        path = self.folder / f"wire-{number}.jsonl"
+        for line in path.read_text().splitlines() if path.exists() else ():
+            try:
+                time_ns, name, request, reply = json.loads(line)
+            except ValueError:  # the last one of a laboratory that was ended
+                continue
+            asked, answer = bytes.fromhex(request if name == "bus" else ""), bytes.fromhex(reply)
+            while len(asked) >= 12:  # Modbus TCP: transaction, protocol, length, unit, function, address, value
+                whole = answer[:4] == asked[:4] and answer[6:8] == asked[6:8]
+                whole = whole and len(answer) >= int.from_bytes(answer[4:6]) + 6
+                address, value = int.from_bytes(asked[8:10]), int.from_bytes(asked[10:12])
+                yield Exchange(time_ns, asked[6], asked[7], address, value, whole)
+                asked = asked[int.from_bytes(asked[4:6]) + 6 :]
+
+    def _read(self, path: Path) -> None:
+        is_of_frames = path.parent.name == "frames"
+        try:
+            with path.open("rb") as file:
+                reader = make_reader(file, decoder_factories=[] if is_of_frames else [DecoderFactory()])
+                if is_of_frames:
+                    self.frames.update((channel.topic, each.log_time) for _, channel, each in reader.iter_messages())
+                else:
+                    for _, channel, message, decoded in reader.iter_decoded_messages():
+                        self._take(channel.topic, message.log_time, decoded)
+        except (McapError, OSError, ValueError) as error:
+            self.unreadable.append(f"{path.parent.name}/{path.name}: {type(error).__name__}")
+
+    def _take(self, topic: str, time_ns: int, message: Any) -> None:
+        if topic == "/experiment/event":
+            data = json.loads(message.data_json or "{}")
+            self.said.append(Said(time_ns, message.level, message.kind, message.text, data))
+        elif topic == "/experiment/step":
+            parameters = json.loads(message.parameters_json or "{}")
+            self.marks.append(Mark(time_ns, message.step_id, message.kind, message.state, parameters))
+        elif topic.endswith("/meta"):
+            self.metas.append((time_ns, message.channel, message.step_id))
+        elif topic == "/sensors/temperature":
+            for described, value in message.ListFields():
+                if described.name.endswith("_degC"):
+                    kind = message.DESCRIPTOR.fields_by_name[f"{described.name}_quality"]
+                    quality = kind.enum_type.values_by_number[getattr(message, kind.name)].name
+                    row = (time_ns, value, quality)
+                    self.temperatures.setdefault(described.name.removesuffix("_degC"), []).append(row)

@@ -1,0 +1,318 @@
+"""What must be so whatever breaks. An invariant is a function of the evidence that yields a sentence for each
+violation; `@invariant` enters it."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests import forked
+from tests.torture.evidence import Evidence
+from tests.torture.lives import COMPLETE, KILLED, ROOT
+
+Rule = Callable[[Evidence], Iterable[str]]
+INVARIANTS: dict[str, Rule] = {}
+MAX_AIR_DEGC, ABOVE_K = 65.0, 3.0
+# As the simulated stand has them: how long a permission lives, a reading is fresh, and the guard's looks are apart.
+HOLD_S, STALE_S, LOOK_S = 15.0, 15.0, 5.0
+STEP_S = 0.5  # of the plant: what is switched within a step acts from its begin on
+MIN_OFF_S = 300.0
+FLAP_SHUT_S = 60.0
+MOST_AN_HOUR = 6
+RELAYS_UNIT, TIMED_ON = 2, 0x0200
+STATUSES = (COMPLETE, 1, 4, 130, KILLED)
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """`rule` was broken; the first of its sentences, and how many there are."""
+
+    rule: str
+    text: str
+    count: int
+
+
+def invariant(rule: Rule) -> Rule:
+    """Enter it under its name."""
+    INVARIANTS[rule.__name__] = rule
+    return rule
+
+
+def violations(evidence: Evidence) -> list[Violation]:
+    """All that is not as it must be; of a program that hung and was killed for it only that."""
+    hung = any(life.status is None for life in evidence.lives)
+    rules = {"ends_as_documented": ends_as_documented} if hung else INVARIANTS
+    judged = ((name, list(rule(evidence))) for name, rule in rules.items())
+    return [Violation(name, sentences[0], len(sentences)) for name, sentences in judged if sentences]
+
+
+# The plant
+
+
+@invariant
+def air_is_never_too_warm(evidence: Evidence) -> Iterator[str]:
+    for truth in evidence.truth:
+        for row in truth[truth["bulk_air_degC"] > MAX_AIR_DEGC + ABOVE_K][:1]:
+            yield f"the air is {row['bulk_air_degC']:.1f} degC at {evidence.at_s(int(row['time_ns']))} s"
+
+
+def _since_s(times_ns: np.ndarray, marks_ns: Iterable[int]) -> np.ndarray:
+    """How long before each instant the last mark was, s; infinite where there was none."""
+    marks = np.array(list(marks_ns), dtype=np.int64)
+    places = np.searchsorted(marks, times_ns, side="right") - 1
+    since = np.full(len(times_ns), np.inf)
+    since[places >= 0] = (times_ns[places >= 0] - marks[places[places >= 0]]) / 1e9
+    return since
+
+
+def _armed(evidence: Evidence, life: int) -> Iterator[int]:
+    """When the heater's relay was switched on for a time."""
+    for each in evidence.bus[life]:
+        if each.unit == RELAYS_UNIT and each.function == 5 and each.address == TIMED_ON:
+            yield each.time_ns
+
+
+@invariant
+def heat_needs_a_permission_of_the_last_15_s(evidence: Evidence) -> Iterator[str]:
+    """The relay's timer, armed by a guard that looks; what a second master switches on is off within 5 s."""
+    for life, truth in enumerate(evidence.truth if "relays" in evidence.stand else ()):
+        on_ns = truth["time_ns"][truth["heater_enabled"] > 0]
+        late = _since_s(on_ns + int(STEP_S * 1e9), _armed(evidence, life)) > HOLD_S + 2 * STEP_S
+        for at_s in map(evidence.at_s, map(int, on_ns[late])):
+            is_odd = evidence.excused(at_s, "bus", "relays", after_s=HOLD_S + 2 * LOOK_S)
+            if not is_odd and not evidence.ordered(at_s, "switch_on", HOLD_S + 2 * LOOK_S):
+                yield f"the heater's relay is on at {at_s} s, {HOLD_S:g} s after it was last armed"
+
+
+@invariant
+def heat_needs_fresh_readings(evidence: Evidence) -> Iterator[str]:
+    """The relay is armed only while the module with the air's thermometer answers. Before the first reading the board's
+    timer is tested, with the regulator stopped."""
+    unit = evidence.stand["thermometer_module"]["unit"]
+    for life, bus in enumerate(evidence.bus if "relays" in evidence.stand else ()):
+        read = [each.time_ns for each in bus if each.unit == unit and each.function in (3, 4) and each.is_answered]
+        armed = np.array(list(_armed(evidence, life)), dtype=np.int64)
+        late = (_since_s(armed, read) > STALE_S + LOOK_S) & (armed > read[0] if read else False)
+        for time_ns in armed[late]:
+            yield f"heat was permitted at {evidence.at_s(int(time_ns))} s without a reading of the air"
+
+
+@invariant
+def nothing_heats_unrecorded(evidence: Evidence) -> Iterator[str]:
+    """No heat before the run's begin is recorded."""
+    begun = [said.time_ns for said in evidence.said if said.kind in ("run.start", "run.resume")]
+    for truth in evidence.truth:
+        heats = (truth["heater_enabled"] > 0) & (truth["heater_on_fraction"] > 0) & (truth["cut_out_open"] == 0)
+        for row in truth[heats][:1]:
+            at_s = evidence.at_s(int(row["time_ns"]))
+            is_odd = evidence.excused(at_s, "heater", "relays.welded", "heat_module", "regulator", after_s=30.0)
+            is_odd = is_odd or evidence.ordered(at_s, "switch_on", HOLD_S)
+            if not is_odd and (not begun or int(row["time_ns"]) + STEP_S * 1e9 < min(begun)):
+                yield f"heat at {at_s} s, before anything was recorded"
+
+
+@invariant
+def compressor_rests(evidence: Evidence) -> Iterator[str]:
+    """Also from life to life. What somebody else switches is none of ours."""
+    off_ns = None
+    has_one = "compressor" in evidence.stand.get("relays", {}).get("channels", {})
+    for truth in evidence.truth if has_one else ():
+        on = truth["compressor_on"] > 0
+        for place in np.flatnonzero(on[1:] != on[:-1]) + 1:
+            time_ns = int(truth["time_ns"][place])
+            at_s = evidence.at_s(time_ns)
+            is_odd = evidence.excused(at_s, "relays", "bus", after_s=30.0) or evidence.ordered(at_s, "switch_on", 30.0)
+            if on[place] and off_ns is not None and not is_odd and (time_ns - off_ns) / 1e9 < MIN_OFF_S - 2 * STEP_S:
+                yield f"the compressor starts at {at_s} s, {(time_ns - off_ns) / 1e9:.0f} s after it stopped"
+            off_ns = off_ns if on[place] else time_ns
+
+
+# The flap, and the safe state
+
+
+def _holds(evidence: Evidence) -> Iterator[tuple[int, int]]:
+    """From when to when the guard's interlock held the run."""
+    begun_ns = None
+    for said in sorted(evidence.said, key=lambda each: each.time_ns):
+        is_interlock = said.data.get("reason") == "interlock"
+        if said.kind == "held" and is_interlock:
+            begun_ns = begun_ns or said.time_ns
+        elif begun_ns and ((said.kind == "released" and is_interlock) or said.kind in ("gap", "run.resume", "run.end")):
+            yield begun_ns, said.time_ns
+            begun_ns = None
+
+
+@invariant
+def flap_is_open_for_captures_only(evidence: Evidence) -> Iterator[str]:
+    """From the begin of a step that opens it (a look in a soak, too) to the end of the one that closes it."""
+    opens = sorted(
+        (mark.time_ns, mark.kind != "CloseFlap" or mark.state != "done")
+        for mark in evidence.marks
+        if mark.kind in ("OpenFlap", "CloseFlap", "SoakUntilSettled")
+    )
+    times_ns = [time_ns for time_ns, _ in opens]
+    for truth in evidence.truth if "flap" in evidence.stand else ():
+        for row in truth[truth["flap_open"] > 0.5][:: int(10 / STEP_S)]:
+            place = int(np.searchsorted(times_ns, int(row["time_ns"]), side="right")) - 1
+            at_s = evidence.at_s(int(row["time_ns"]))
+            if (place < 0 or not opens[place][1]) and not evidence.excused(at_s, "flap", after_s=FLAP_SHUT_S):
+                yield f"the flap is open at {at_s} s, outside captures"
+
+
+_SAFE = {"heater_enabled": HOLD_S + LOOK_S, "compressor_on": HOLD_S + LOOK_S, "flap_open": FLAP_SHUT_S}
+"""What is off, or shut, in the safe state, and within how many s."""
+
+
+@invariant
+def holds_are_safe(evidence: Evidence) -> Iterator[str]:
+    for begin_ns, end_ns in _holds(evidence):
+        for truth in evidence.truth:
+            if len(truth) and truth["time_ns"][0] <= begin_ns <= truth["time_ns"][-1]:
+                for name, within_s in _SAFE.items():
+                    yield from _acting(evidence, truth, name, begin_ns + int(within_s * 1e9), end_ns, "a hold")
+
+
+@invariant
+def ends_are_safe(evidence: Evidence) -> Iterator[str]:
+    """30 s after the program is gone, however it went, and from then on; a flap that nobody can shut apart."""
+    for truth, life in zip(evidence.truth, evidence.lives, strict=True):
+        for name in _SAFE if len(truth) else ():
+            if name != "flap_open" or life.status != KILLED:
+                end_ns = int(truth["time_ns"][-1])
+                when = f"the end with status {life.status}"
+                yield from _acting(evidence, truth, name, end_ns - int(60e9), end_ns, when)
+
+
+def _acting(evidence: Evidence, truth: np.ndarray, name: str, begin_ns: int, end_ns: int, when: str) -> Iterator[str]:
+    """The first time at which this is on, or open, though what drives it can be reached."""
+    drives = ("flap",) if name == "flap_open" else ("relays", "bus")
+    if name == "compressor_on" and "climate_chamber" in evidence.stand:
+        drives = ("chamber",)
+    elif name == "heater_enabled" and "relays" not in evidence.stand:
+        return
+    for row in truth[(truth["time_ns"] > begin_ns) & (truth["time_ns"] <= end_ns) & (truth[name] > 0.01)]:
+        at_s = evidence.at_s(int(row["time_ns"]))
+        if not evidence.excused(at_s, *drives, after_s=60.0) and not evidence.ordered(at_s, "switch_on", 40.0):
+            yield f"{name} is {row[name]:.2g} at {at_s} s, in {when}"
+            return
+
+
+# Records
+
+
+@invariant
+def files_are_readable(evidence: Evidence) -> Iterator[str]:
+    yield from evidence.unreadable if evidence.is_complete else ()
+
+
+@invariant
+def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
+    """What HTTP said was saved, and what captures that are done have to have."""
+    for (topic, time_ns), count in evidence.frames.items():
+        if count > 1:
+            yield f"{topic} has the frame at {evidence.at_s(time_ns)} s {count} times"
+    for row in (row for doors in evidence.doors for row in doors):
+        run = row["answer"].get("run") if isinstance(row["answer"], dict) else None
+        there = sum(time_ns <= row["time_ns"] for _, time_ns in evidence.frames)
+        if run and run["frames_saved"] > there:
+            at_s = evidence.at_s(row["time_ns"])
+            yield f"{run['frames_saved']} frames were saved at {at_s} s, of which {there} are there"
+    skipped = {entry.get("step_id") for entry in evidence.journal if entry["entry"] == "Skipped"}
+    lost = {said.data.get("step_id") for said in evidence.said if "lost" in said.kind or "dropped" in said.kind}
+    taken = Counter(step_id for _, _, step_id in evidence.metas)
+    for mark in evidence.marks:
+        if mark.kind == "Capture" and mark.state == "done" and mark.step_id not in skipped | lost:
+            cameras = len(mark.parameters.get("cameras", ())) or len(evidence.stand["cameras"])
+            if evidence.is_complete and taken[mark.step_id] < (wanted := mark.parameters["frames"] * cameras):
+                yield f"the capture {mark.step_id} is done with {taken[mark.step_id]} of {wanted} frames"
+
+
+@invariant
+def journal_and_recording_agree(evidence: Evidence) -> Iterator[str]:
+    """The steps that are done, of a run that is complete and was not killed: each once in both."""
+    if not evidence.is_complete or evidence.killed:
+        return
+    journal = Counter((row["step_id"], row["state"]) for row in evidence.journal if row["entry"] == "Step")
+    recorded = Counter((mark.step_id, mark.state) for mark in evidence.marks if mark.state != "failed")
+    for key in sorted(journal.keys() | recorded.keys()):
+        if journal[key] != recorded[key]:
+            yield f"step {key[0]} {key[1]}: {journal[key]} times in the journal, {recorded[key]} in the recording"
+
+
+_SENSOR_K = 1.0  # the module's +-0.1 % of 200 K, a converter's noise, and how far the plant moves within a poll
+_TRUE = {name: f"{name}_degC" for name in ("air", "granite_inside", "granite_outside", "artifact", "laboratory")}
+
+
+@invariant
+def readings_are_true(evidence: Evidence) -> Iterator[str]:
+    """A GOOD reading is what the plant was, within what its sensor may be off; of sensors that were not broken."""
+    for name, rows in evidence.temperatures.items():
+        for time_ns, value, quality in rows if name in _TRUE else ():
+            at_s, row = evidence.at_s(time_ns), evidence.true_at(time_ns)
+            is_odd = evidence.excused(at_s, "thermometer", "regulator.probe_exchanged", after_s=30.0)
+            if row is None or is_odd or not quality.endswith("GOOD"):
+                continue
+            if abs(value - (true := float(row[_TRUE[name]]))) > _SENSOR_K:
+                yield f"{name} was read as {value:.2f} degC at {at_s} s, and is {true:.2f} degC"
+
+
+@invariant
+def verify_finds_what_is_lost_and_nothing_else(evidence: Evidence) -> Iterator[str]:
+    """Of a run that is complete nothing is damaged, and what is missing has an event that says so."""
+    if not evidence.is_complete:
+        return
+    program = [sys.executable, "-m", "stand.cli", "session", "verify", "--json", str(evidence.session)]
+    ended = forked.run(program, cwd=ROOT, capture_output=True, text=True)
+    try:
+        found = json.loads(ended.stdout)
+    except ValueError:
+        yield f"verify ended with {ended.returncode}: {ended.stderr[-300:]}"
+        return
+    lost = any("lost" in said.kind or "dropped" in said.kind for said in evidence.said)
+    if not found["sound"] and not lost:
+        yield f"verify finds {found['findings'][:2]}"
+    if found["frames"] != len(evidence.frames):
+        yield f"verify counts {found['frames']} frames, there are {len(evidence.frames)}"
+
+
+# How it ends
+
+
+@invariant
+def ends_as_documented(evidence: Evidence) -> Iterator[str]:
+    for number, life in enumerate(evidence.lives):
+        if life.status is None:
+            yield f"life {number} hung: {life.err[-3000:]}"
+        elif life.status not in STATUSES:
+            yield f"life {number} ended with status {life.status}: {(life.err or life.out)[-400:]}"
+        elif any(word in life.err for word in ("Traceback", "never retrieved", "was destroyed")):
+            yield f"life {number}: {life.err[-600:]}"
+        elif life.status not in (COMPLETE, KILLED) and not life.err.strip():
+            yield f"life {number} ended with status {life.status} and said nothing"
+
+
+@invariant
+def is_completed_in_the_end(evidence: Evidence) -> Iterator[str]:
+    """Faults end; a run that is resumed after them comes to its end."""
+    last = evidence.lives[-1]
+    if last.status is not None and not evidence.is_complete and "complete, but" not in last.err:
+        yield f"not complete after {len(evidence.lives)} lives: {last.err.strip()[-400:]}"
+
+
+@invariant
+def nobody_is_pestered(evidence: Evidence) -> Iterator[str]:
+    """No warning or error more than six times an hour."""
+    times: dict[tuple[str, str], list[int]] = {}
+    for said in evidence.said:
+        if said.level != "info":
+            times.setdefault((said.kind, re.sub(r"[\d.]+", "#", said.text)), []).append(said.time_ns)
+    for (kind, text), when in times.items():
+        spans = [last - first for first, last in zip(when, when[MOST_AN_HOUR:], strict=False)]
+        if spans and min(spans) < 3600e9:
+            yield f"{kind} {MOST_AN_HOUR + 1} times in {min(spans) / 1e9:.0f} s: {text[:200]}"

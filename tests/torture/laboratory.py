@@ -1,0 +1,119 @@
+"""The simulated laboratory of a torture run: `python -m tests.torture.laboratory`, in the place of `drivers.sim`.
+
+It breaks what the case says, in the case's own time, and writes down what truly happened in the program's N-th life:
+the plant at each of its steps (truth-N.bin) and the bytes on each wire (wire-N.jsonl). When the program is gone, time
+goes on for AFTER_S: what is on then shows.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from drivers.sim.control import serve_control
+from drivers.sim.fault_schedule import FaultSchedule, PlannedFault
+from drivers.sim.laboratory import Laboratory
+from drivers.sim.laboratory_spec import LaboratorySpec
+from foundation.clock import seconds_ns
+from foundation.documents import parse_document
+from foundation.ending import Ending
+from foundation.errors import ConfigError
+from tests.torture.case import Case, read_case
+
+FOLDER, LIFE = "TORTURE_FOLDER", "TORTURE_LIFE"
+AFTER_S = 90.0
+MENDED_AT_LIFE = 6
+TRUTH = (
+    *("heater_enabled", "heater_on_fraction", "compressor_on", "flap_open", "cut_out_open", "camera_powered"),
+    *("bulk_air_degC", "air_degC", "chamber_degC", "granite_inside_degC", "granite_outside_degC", "artifact_degC"),
+    *("laboratory_degC", "body_degC", "sensor_degC"),
+)
+ROW = struct.Struct(f"<q{len(TRUTH)}d")
+
+
+class ObservedLaboratory(Laboratory):
+    """As it is, and it takes notes."""
+
+    def __init__(self, spec: LaboratorySpec, folder: Path, life: int) -> None:
+        self._truth = (folder / f"truth-{life}.bin").open("wb")
+        self._wires = (folder / f"wire-{life}.jsonl").open("w", buffering=1)
+        super().__init__(spec)
+        self.plant.on_step.append(self._note)  # after the regulator's and the relays'
+
+    def after(self) -> None:
+        """Time goes on without the program."""
+        if self.is_virtual:
+            self.advance(self.now_ns + seconds_ns(AFTER_S))
+
+    def close(self) -> None:
+        super().close()
+        self._truth.close()
+        self._wires.close()
+
+    def _note(self, time_ns: int, dt_s: float) -> None:
+        plant = self.plant
+        values = [plant.flap_open_at(time_ns) if name == "flap_open" else float(getattr(plant, name)) for name in TRUTH]
+        self._truth.write(ROW.pack(time_ns, *values))
+
+    def _listen(self, name, address, make_engine) -> None:
+        super()._listen(name, address, make_engine)
+        faults = self._links[name].faults
+        apply = faults.apply
+
+        def heard(request: bytes, reply: bytes) -> list[bytes]:
+            pieces = apply(request, reply)
+            row = [self.now_ns, name, request.hex(), b"".join(pieces).hex()]
+            with suppress(ValueError):  # closed
+                self._wires.write(f"{json.dumps(row)}\n")
+            return pieces
+
+        faults.apply = heard
+
+
+class Breaking(FaultSchedule):
+    """Faults as planned; of those that this laboratory cannot have nothing comes."""
+
+    def _set(self, name: str, value: object) -> None:
+        with suppress(ConfigError):
+            super()._set(name, value)
+
+
+def planned(case: Case, now_ns: int, life: int) -> list[PlannedFault]:
+    """What is still to come of the case's faults, or stands, seen from now. Who has resumed a run so often has mended
+    everything."""
+    if life >= MENDED_AT_LIFE:
+        return []
+    now_s = (now_ns - case.start_ns) / 1e9
+    left = [fault for fault in case.faults if fault.at_s + fault.for_s > now_s]
+    return [
+        PlannedFault(each.name, each.value, max(0.0, each.at_s - now_s), each.for_s - max(0.0, now_s - each.at_s))
+        for each in left
+    ]
+
+
+def main() -> int:
+    ending, parent = Ending((signal.SIGTERM, signal.SIGINT)), os.getppid()
+    folder = Path(os.environ[FOLDER])
+    spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
+    life, case = int(os.environ[LIFE]), read_case(folder / "case.yaml")
+    (begun := folder / f"begun-{life}").touch()
+    laboratory = ObservedLaboratory(spec, folder, life)
+    schedule = Breaking(laboratory, planned(case, laboratory.now_ns, life))
+    control = serve_control(laboratory, schedule, ending.ask)
+    print(json.dumps({**laboratory.addresses, "control": control.address}), flush=True)  # noqa: T201 - as drivers.sim
+    while not ending.wait(0.1) and os.getppid() == parent:
+        schedule.tick()
+    laboratory.after()
+    laboratory.close()
+    control.close()
+    begun.unlink()  # all is written
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""A case from its begin to its end: the program's lives one after the other, until the plan is complete."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from tests import forked
+from tests.torture.case import Case, stand_document, write_case
+
+ROOT = Path(__file__).parents[2]
+MOST_LIVES = 10
+REAL_S = float(os.environ.get("TORTURE_REAL_S", "400"))  # of one life: a longer one hangs
+_LABORATORY_S, _LOOK_S = 20.0, 0.02  # that of a program that was killed writes down what comes after
+KILLED, COMPLETE, BAD_INPUT = -9, 0, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """command: what was asked. status: None for a program that hung and was killed."""
+
+    command: list[str]
+    status: int | None
+    out: str
+    err: str
+
+
+def live(case: Case, folder: Path) -> list[Life]:
+    """Run, and resume after each end but the plan's, as an operator would who has removed the cause."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    (folder / "case.yaml").write_text(write_case(case))
+    (folder / "stand.yaml").write_text(yaml.safe_dump(stand_document(case, folder)))
+    (folder / "plan.yaml").write_text(yaml.safe_dump({"name": "torture", **case.plan}))
+    out, config, lives = folder / "out", ["--config", str(folder / "stand.yaml"), "--quiet"], list[Life]()
+    while len(lives) < MOST_LIVES:
+        sessions = sorted(path.parent for path in out.glob("*/journal.jsonl") if path.stat().st_size)
+        if sessions:
+            command = ["resume", str(sessions[0]), *config, *(["--clear"] if lives[-1].status != KILLED else [])]
+        else:
+            shutil.rmtree(out, ignore_errors=True)
+            command = ["run", str(folder / "plan.yaml"), *config, "--out", str(out), "--virtual-time"]
+        lives.append(_life(folder, len(lives), command + ["--attended"] * case.attended))
+        if lives[-1].status in (COMPLETE, None, BAD_INPUT):
+            break
+    return lives
+
+
+def _life(folder: Path, number: int, command: list[str]) -> Life:
+    program = [sys.executable, "-m", "tests.torture.product", str(folder), str(number), *command]
+    process = forked.popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    status: int | None = None
+    try:
+        out, err = process.communicate(timeout=REAL_S)
+        status = process.returncode
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGUSR1)  # it says where it is
+        _wait(1.0)
+        process.kill()
+        out, err = process.communicate()
+    (folder / f"said-{number}.txt").write_text(out + err)
+    for _ in range(round(_LABORATORY_S / _LOOK_S)):
+        if not (folder / f"begun-{number}").exists():
+            break
+        _wait(_LOOK_S)
+    return Life(command, status, out, err)
+
+
+def _wait(real_s: float) -> None:
+    time.sleep(real_s)  # noqa: TID251 - other processes are waited for

@@ -1,0 +1,191 @@
+"""One life of the program under torture: `python -m tests.torture.product FOLDER LIFE COMMAND...` is `stand COMMAND...`
+on the case of that folder.
+
+The laboratory is an observed one, sleepers and ready tasks run in a drawn order, and what people do to a stand is done
+at its instant of virtual time, over the same doors: HTTP, signals, the bus. What the doors say is written down
+(doors-N.jsonl).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import faulthandler
+import http.client
+import json
+import os
+import random
+import re
+import signal
+import socket
+import struct
+import sys
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from pathlib import Path
+
+import stand.running.run as run_module
+from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from foundation.errors import StandError
+from stand.simulator import Simulator
+from tests.torture.case import Case, Order, read_case
+from tests.torture.laboratory import FOLDER, LIFE
+
+LOOK_EVERY_S, LOOKS = 300.0, 200  # at what HTTP says
+_DOOR_S = 20.0  # of the host
+_TASKS = ("TaskStepMethWrapper", "TaskWakeupMethWrapper", "builtin_function_or_method")
+_SIGNALS = {"stop": signal.SIGTERM, "interrupt": signal.SIGINT}
+
+
+class DrawnLoop(asyncio.SelectorEventLoop):
+    """Tasks that are ready at one turn run in a drawn order; all other callbacks stay where they are. What is drawn
+    depends on the instant alone, so that turns of the loop that a busy machine adds change nothing later."""
+
+    seed = 0
+    clock: VirtualClock | None = None
+    _drawn, _at_ns = random.Random(), -1
+
+    def _run_once(self) -> None:
+        ready = self._ready
+        if len(ready) > 1:
+            places = [place for place, handle in enumerate(ready) if type(handle._callback).__name__ in _TASKS]
+            if len(places) > 1:
+                now_ns = 0 if self.clock is None else self.clock.now_ns()
+                if now_ns != self._at_ns:
+                    self._at_ns, self._drawn = now_ns, random.Random(f"{self.seed} {now_ns}")
+                handles = [ready[place] for place in places]
+                self._drawn.shuffle(handles)
+                for place, handle in zip(places, handles, strict=True):
+                    ready[place] = handle
+        super()._run_once()
+
+
+class TortureClock(VirtualClock):
+    """Virtual time in which somebody does things to the stand."""
+
+    def __init__(self, schedule: Schedule, start_ns: int, advance: Callable[[int], Awaitable[None]]) -> None:
+        super().__init__(start_ns, advance)
+        self._schedule, self._begun = schedule, None
+        loop = asyncio.get_running_loop()
+        if schedule.case.drawn_order:
+            drawn = random.Random(f"{schedule.case.seed} {start_ns}")
+            self._order = iter(lambda: drawn.getrandbits(62), -1)
+        if isinstance(loop, DrawnLoop):
+            loop.clock = self
+
+    async def run(self) -> None:
+        if self._begun is None:
+            self._begun = asyncio.create_task(self._schedule.run(self))
+        await super().run()
+
+
+class Schedule:
+    """What people do, in its order."""
+
+    def __init__(self, case: Case, folder: Path, life: int) -> None:
+        self.case, self._folder = case, folder
+        self._doors = (folder / f"doors-{life}.jsonl").open("w")
+
+    async def run(self, clock: VirtualClock) -> None:
+        begin_s = (clock.now_ns() - self.case.start_ns) / NS_PER_S
+        kills = [Order("kill", at_s) for at_s in self.case.kills_s]
+        looks = [Order("state", begin_s + LOOK_EVERY_S * (number + 1)) for number in range(LOOKS)]
+        for order in sorted((*self.case.orders, *kills, *looks), key=lambda order: order.at_s):
+            if order.at_s > begin_s:
+                await clock.sleep_until(self.case.start_ns + seconds_ns(order.at_s))
+                with clock.hold():
+                    await asyncio.to_thread(self._do, order, clock.now_ns())
+
+    def _do(self, order: Order, now_ns: int) -> None:
+        session = next(iter(sorted((self._folder / "out").glob("*/journal.jsonl"))), None)
+        session = session and session.parent
+        match order.verb:
+            case "kill":
+                self._note(order, now_ns, self._asked(session, "GET", "state"))
+                os.kill(os.getpid(), signal.SIGKILL)
+            case "stop" | "interrupt":
+                self._note(order, now_ns, None)
+                os.kill(os.getpid(), _SIGNALS[order.verb])
+            case "switch_on" | "switch_off":
+                self._note(order, now_ns, self._second_master(order))
+            case "state":
+                state = self._asked(session, "GET", "state")
+                self._note(order, now_ns, state)
+                if self.case.attended and isinstance(state, dict) and state.get("prompt"):
+                    self._asked(session, "POST", "run/continue", {})
+            case "skip" | "extend":
+                plan = self._asked(session, "GET", "plan")
+                steps = plan if isinstance(plan, list) else []
+                under_way = next((each["step_id"] for each in steps if each.get("standing") == "under_way"), "none")
+                by: dict[str, object] = {"by_s": 60.0} if order.verb == "extend" else {}
+                body = {**by, "step_id": under_way}
+                self._note(order, now_ns, self._asked(session, "POST", f"run/{order.verb}", body))
+            case "note":
+                name = session.name if session else "none"
+                body = {"text": "a note", "tags": ["torture"]}
+                self._note(order, now_ns, self._asked(session, "POST", f"sessions/{name}/notes", body))
+            case _:
+                self._note(order, now_ns, self._asked(session, "POST", f"run/{order.verb}", {}))
+
+    def _note(self, order: Order, now_ns: int, answer: object) -> None:
+        row = {"time_ns": now_ns, "verb": order.verb, "body": order.body, "answer": answer}
+        self._doors.write(f"{json.dumps(row)}\n")
+        self._doors.flush()
+
+    def _asked(self, session: Path | None, method: str, path: str, body: dict[str, object] | None = None) -> object:
+        """The answer, or the sentence of a refusal; None where there is nobody to ask."""
+        from stand.serving.client import server_of
+
+        if session is None:
+            return None
+        try:
+            return server_of(session).request(method, f"/api/v1/{path}", body, _DOOR_S)
+        except (StandError, OSError, http.client.HTTPException) as error:
+            return {"refused": str(error)}
+
+    def _second_master(self, order: Order) -> object:
+        """Another program on the bus writes a coil of the relay board, for good."""
+        found = re.fullmatch(r"tcp:(.+):(\d+)", os.environ.get("TORTURE_BUS", ""))
+        if found is None:
+            return None
+        value = 0xFF00 if order.verb == "switch_on" else 0
+        frame = struct.pack(">HHHBBHH", 7, 0, 6, 2, 5, int(order.body.get("relay", 0)), value)
+        with suppress(OSError), socket.create_connection((found[1], int(found[2])), 1.0) as wire:
+            wire.settimeout(1.0)
+            wire.sendall(frame)
+            return wire.recv(64).hex()
+        return None
+
+
+def _say_where() -> None:
+    """What waits for what, of a program that hangs."""
+    faulthandler.dump_traceback()
+    for task in asyncio.all_tasks():
+        task.print_stack(limit=3, file=sys.stderr)
+
+
+def main() -> None:
+    signal.signal(signal.SIGUSR1, lambda *_: _say_where())
+    folder, life, *command = sys.argv[1:]
+    case = read_case(Path(folder) / "case.yaml")
+    schedule = Schedule(case, Path(folder), int(life))
+    os.environ |= {FOLDER: folder, LIFE: life}
+    Simulator.module = "tests.torture.laboratory"
+    begin = Simulator.__init__
+
+    def begun(self: Simulator, laboratory: dict[str, object]) -> None:
+        begin(self, laboratory)
+        os.environ["TORTURE_BUS"] = self.addresses["bus"]
+
+    Simulator.__init__ = begun
+    run_module.VirtualClock = lambda start_ns, advance: TortureClock(schedule, start_ns, advance)
+    if case.drawn_order:
+        DrawnLoop.seed = case.seed
+        asyncio.events.new_event_loop = asyncio.runners.events.new_event_loop = DrawnLoop
+    sys.argv = ["stand", *command]
+    from stand.cli import app
+
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""Each invariant of the torture rig finds what it forbids, and nothing in a quiet case; drawing and shrinking."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.system.conftest import require_aravis
+from tests.torture.case import MOST_FAULTS, PLAIN, Case, Fault, Order, draw, read_case, smaller, steps_of, write_case
+from tests.torture.evidence import Evidence, Said
+from tests.torture.invariants import INVARIANTS, RELAYS_UNIT, violations
+from tests.torture.lives import live
+from tests.torture.rig import shrunk
+
+QUIET = {
+    "steps": [
+        "close_flap",
+        {"start_chamber": 26},
+        {"soak": 300},
+        "open_flap",
+        {"capture": {"frames": 2, "interval_s": 5, "role": "fit"}},
+        "close_flap",
+        {"set_temperature": 16},
+        {"soak": 300},
+        "stop_chamber",
+    ]
+}
+
+
+@pytest.fixture(scope="module")
+def quiet() -> Iterator[Evidence]:
+    """Of a case in which nothing breaks."""
+    require_aravis()
+    case = Case(1, {**PLAIN, "axes": "no axes"}, QUIET)
+    with tempfile.TemporaryDirectory() as folder:
+        evidence = Evidence(case, Path(folder), live(case, Path(folder)))
+        assert evidence.truth
+        assert evidence.bus
+        assert evidence.doors
+        assert evidence.journal
+        yield evidence
+
+
+def changed(evidence: Evidence, name: str, value: float, first: float = 0.0, last: float = 1.0) -> None:
+    """What the plant's column was in this part of its time."""
+    for truth in evidence.truth:
+        truth[name][round(first * len(truth)) : round(last * len(truth))] = value
+
+
+def middle_ns(evidence: Evidence) -> int:
+    return int(np.median(evidence.truth[0]["time_ns"]))
+
+
+def no_more(evidence: Evidence, is_of_it: Callable[[int], bool]) -> None:
+    """Nothing is said to such units from the middle on."""
+    middle = middle_ns(evidence)
+    evidence.bus[0] = [each for each in evidence.bus[0] if each.time_ns < middle or not is_of_it(each.unit)]
+    changed(evidence, "heater_enabled", 1.0, 0.4)
+
+
+def hold(evidence: Evidence) -> None:
+    begin = middle_ns(evidence)
+    evidence.said.append(Said(begin, "warning", "held", "", {"reason": "interlock"}))
+    evidence.said.append(Said(begin + int(200e9), "info", "released", "", {"reason": "interlock"}))
+    changed(evidence, "heater_enabled", 1.0)
+
+
+def end(evidence: Evidence, status: int | None) -> None:
+    evidence.lives = [*evidence.lives[:-1], replace(evidence.lives[-1], status=status)]
+
+
+def pester(evidence: Evidence) -> None:
+    evidence.said += [Said(number, "warning", "some", f"{number} K", {}) for number in range(8)]
+
+
+def switch_compressor(evidence: Evidence) -> None:
+    changed(evidence, "compressor_on", 0.0)
+    changed(evidence, "compressor_on", 1.0, 0.2, 0.3)
+    changed(evidence, "compressor_on", 1.0, 0.32, 0.4)
+
+
+def misread(evidence: Evidence) -> None:
+    evidence.temperatures["air"] = [(at, degC + 2.0, quality) for at, degC, quality in evidence.temperatures["air"]]
+
+
+FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
+    "air_is_never_too_warm": lambda evidence: changed(evidence, "bulk_air_degC", 69.0, 0.5, 0.6),
+    "heat_needs_a_permission_of_the_last_15_s": lambda evidence: no_more(evidence, lambda unit: unit == RELAYS_UNIT),
+    "heat_needs_fresh_readings": lambda evidence: no_more(evidence, lambda unit: unit != RELAYS_UNIT),
+    "nothing_heats_unrecorded": lambda evidence: evidence.said.clear(),
+    "compressor_rests": switch_compressor,
+    "flap_is_open_for_captures_only": lambda evidence: changed(evidence, "flap_open", 1.0),
+    "holds_are_safe": hold,
+    "ends_are_safe": lambda evidence: changed(evidence, "heater_enabled", 1.0, 0.9),
+    "files_are_readable": lambda evidence: evidence.unreadable.append("frames/1.mcap"),
+    "frames_saved_are_there_once": lambda evidence: evidence.frames.update(list(evidence.frames)[:1]),
+    "journal_and_recording_agree": lambda evidence: evidence.marks.pop(),
+    "readings_are_true": misread,
+    "verify_finds_what_is_lost_and_nothing_else": lambda evidence: evidence.frames.popitem(),
+    "ends_as_documented": lambda evidence: end(evidence, 77),
+    "is_completed_in_the_end": lambda evidence: end(evidence, 1),
+    "nobody_is_pestered": pester,
+}
+"""For each invariant what is changed in the evidence, so that it must be found."""
+
+
+def test_a_quiet_case_breaks_no_invariant(quiet: Evidence):
+    assert quiet.is_complete
+    assert sum(quiet.frames.values()) == 2
+    assert violations(quiet) == []
+
+
+@pytest.mark.parametrize("name", INVARIANTS)
+def test_an_invariant_finds_what_it_forbids(quiet: Evidence, name: str):
+    evidence = copy.deepcopy(quiet)
+    evidence.__dict__["truth"] = [truth.copy() for truth in quiet.truth]
+    FORBIDDEN[name](evidence)
+    assert list(INVARIANTS[name](evidence))
+
+
+def test_a_seed_draws_the_same_case_and_a_case_is_read_as_it_was_written(tmp_path: Path):
+    for seed in range(40):
+        case = draw(seed)
+        assert case == draw(seed)
+        assert len(case.faults) <= MOST_FAULTS
+        (path := tmp_path / "case.yaml").write_text(write_case(case))
+        assert read_case(path) == case
+
+
+def test_a_broken_case_is_shrunk_to_what_breaks_it(monkeypatch: pytest.MonkeyPatch):
+    """The search alone: a case counts as broken while it has this fault and a camera."""
+    from tests.torture import rig
+
+    def is_broken(case: Case) -> set[str]:
+        return {"x"} if any(fault.name == "flap.jam" for fault in case.faults) else set[str]()
+
+    faults = tuple(Fault(name, True, 5.0, 60.0) for name in ("bus.cut", "flap.jam", "flap.stall", "camera.deaf"))
+    case = replace(draw(3), faults=faults, orders=(Order("pause", 3.0),), kills_s=(9.0,))
+    monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter()))
+    monkeypatch.setattr(rig.Result, "broken", property(lambda self: is_broken(self.case)))
+    least = shrunk(case, {"x"}, 200)
+    assert [fault.name for fault in least.faults] == ["flap.jam"]
+    assert (least.orders, least.kills_s, least.drawn_order) == ((), (), False)
+    assert steps_of(least.plan) < steps_of(case.plan)
+    assert len(list(smaller(least))) <= steps_of(least.plan) + 8
