@@ -8,13 +8,13 @@ import math
 import multiprocessing
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 
 from tests import forked
-from tests.torture.case import KINDS, ORDERS, draw, read_case, write_case
+from tests.torture.case import draw, read_case, write_case
+from tests.torture.coverage import Reached
 from tests.torture.rig import Result, perform, perform_seed, shrunk, told
 
 
@@ -74,15 +74,10 @@ def _performed(seeds: Iterable[int], end_s: float, jobs: int) -> Iterator[Result
 
 
 def _report(results: Iterator[Result], left: Callable[[int, float], float], tries: int) -> int:
-    count, broken, simulated_s, begun_s = 0, 0, 0.0, time.monotonic()
-    events, rules, kinds, ends = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
+    count, broken, simulated_s, begun_s, reached = 0, 0, 0.0, time.monotonic(), Reached()
     for result in results:
         count, simulated_s, broken = count + 1, simulated_s + result.simulated_s, broken + bool(result.violations)
-        events, rules = events + result.events, rules + result.rules
-        kinds.update(fault.name for fault in result.case.faults)
-        kinds.update(order.verb for order in result.case.orders)
-        kinds["kill"] += len(result.case.kills_s)
-        ends.update(str(life.status) for life in result.lives)
+        reached.add(result)
         minutes_left = left(count, time.monotonic() - begun_s) / 60.0
         first, *more = told(result)
         say("\n".join([f"{first}    [{count} cases, {minutes_left:.0f} min left]", *more]))
@@ -91,9 +86,7 @@ def _report(results: Iterator[Result], left: Callable[[int, float], float], trie
             say(f"python -m tests.torture {result.case.seed}    shrunk to:\n{write_case(least)}")
     minutes = (time.monotonic() - begun_s) / 60.0
     say(f"{count} cases, {broken} broken; {simulated_s / 3600.0:.1f} simulated hours in {minutes:.1f} min")
-    for name, reached in (("ends", ends), ("rules", rules), ("kinds", kinds), ("events", events)):
-        say(f"{name}: {', '.join(f'{each} {number}' for each, number in reached.most_common())}")
-    say(f"never drawn: {', '.join(sorted({*KINDS, *ORDERS} - kinds.keys()))}")
+    say("\n".join(reached.told()))
     return int(broken > 0)
 
 

@@ -137,9 +137,17 @@ _TIMES_OUT = ("silent", "unplugged", "mute", "silent_s", "swallows_first", "comp
 _NAMES = {"5": ("air", "granite_inside", "granite_outside", "artifact", "laboratory"), "2": ("air", "granite_inside")}
 ORDERS = (
     *("pause", "continue", "clear", "stop", "note", "skip", "extend", "interrupt", "state"),
-    *("switch_on", "switch_off"),
+    *("switch_on", "switch_off", "lose_folder", "fill_disk", "refuse_writes"),
 )
-"""The operator's commands over HTTP, two signals, a second client's look, and a second master that writes coils."""
+"""The operator's commands over HTTP, two signals, a second client's look, a second master that writes coils, and what
+happens to the disk of the session."""
+UNDONE = {
+    "pause": ("continue",),
+    "lose_folder": ("find_folder", "clear"),
+    "fill_disk": ("empty_disk", "clear"),
+    "refuse_writes": ("take_writes",),
+}
+"""What follows on an order, some time later."""
 
 
 def draw(seed: int) -> Case:
@@ -241,8 +249,8 @@ def _orders(drawn: random.Random, left: set[str], duration_s: float) -> Iterator
     for verb in drawn.choices(verbs, k=drawn.randint(1, MOST_ORDERS)):
         at_s = round(drawn.uniform(0.0, duration_s), 1)
         yield Order(verb, at_s, {"relay": drawn.choice((0, 1, 3))} if verb.startswith("switch") else {})
-        if verb == "pause":
-            yield Order("continue", round(at_s + drawn.choice((10.0, 300.0, 1200.0)), 1))
+        after_s = drawn.choice((10.0, 300.0, 1200.0))
+        yield from (Order(each, round(at_s + after_s + number, 1)) for number, each in enumerate(UNDONE.get(verb, ())))
 
 
 def _kills(drawn: random.Random, left: set[str], duration_s: float) -> tuple[float, ...]:
@@ -270,7 +278,7 @@ def stand_document(case: Case, folder: Path) -> dict[str, Any]:
 def smaller(case: Case) -> Iterator[Case]:
     """What a failing case could be instead, the boldest first."""
     for name in ("faults", "orders", "kills_s"):
-        whole = getattr(case, name)
+        whole: tuple[Any, ...] = getattr(case, name)
         half = len(whole) // 2
         parts = [(), whole[:half], whole[half:]] if half else [()] if whole else []
         for part in parts:

@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 MOST_LIVES = 10
 REAL_S = float(os.environ.get("TORTURE_REAL_S", "400"))  # of one life: a longer one hangs
 _LABORATORY_S, _LOOK_S = 20.0, 0.02  # that of a program that was killed writes down what comes after
+HIDDEN = "hidden"  # where a session's folder is that was lost
 KILLED, COMPLETE, BAD_INPUT = -9, 0, 2
 
 
@@ -36,12 +37,13 @@ class Life:
 def live(case: Case, folder: Path) -> list[Life]:
     """Run, and resume after each end but the plan's, as an operator would who has removed the cause."""
     shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    (folder / HIDDEN).mkdir(parents=True)
     (folder / "case.yaml").write_text(write_case(case))
     (folder / "stand.yaml").write_text(yaml.safe_dump(stand_document(case, folder)))
     (folder / "plan.yaml").write_text(yaml.safe_dump({"name": "torture", **case.plan}))
     out, config, lives = folder / "out", ["--config", str(folder / "stand.yaml"), "--quiet"], list[Life]()
     while len(lives) < MOST_LIVES:
+        find_folder(folder)
         sessions = sorted(path.parent for path in out.glob("*/journal.jsonl") if path.stat().st_size)
         if sessions:
             command = ["resume", str(sessions[0]), *config, *(["--clear"] if lives[-1].status != KILLED else [])]
@@ -51,7 +53,17 @@ def live(case: Case, folder: Path) -> list[Life]:
         lives.append(_life(folder, len(lives), command + ["--attended"] * case.attended))
         if lives[-1].status in (COMPLETE, None, BAD_INPUT):
             break
+    find_folder(folder)
     return lives
+
+
+def find_folder(folder: Path) -> bool:
+    """Bring back the session's folder that was lost; whether one was."""
+    lost = list((folder / HIDDEN).iterdir())
+    for each in lost:
+        shutil.rmtree(folder / "out" / each.name, ignore_errors=True)
+        each.rename(folder / "out" / each.name)
+    return bool(lost)
 
 
 def _life(folder: Path, number: int, command: list[str]) -> Life:

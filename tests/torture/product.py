@@ -9,6 +9,7 @@ at its instant of virtual time, over the same doors: HTTP, signals, the bus. Wha
 from __future__ import annotations
 
 import asyncio
+import errno
 import faulthandler
 import http.client
 import json
@@ -26,9 +27,11 @@ from pathlib import Path
 import stand.running.run as run_module
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.errors import StandError
+from recording.writing import notices
 from stand.simulator import Simulator
 from tests.torture.case import Case, Order, read_case
 from tests.torture.laboratory import FOLDER, LIFE
+from tests.torture.lives import HIDDEN, find_folder
 
 LOOK_EVERY_S, LOOKS = 300.0, 200  # at what HTTP says
 _DOOR_S = 20.0  # of the host
@@ -78,11 +81,28 @@ class TortureClock(VirtualClock):
         await super().run()
 
 
+class Disk:
+    """That of the session, as the system's calls show it; it is the real one until something is set."""
+
+    is_full = refuses = False
+
+    def __init__(self) -> None:
+        synced, space = os.fdatasync, notices.disk_space
+
+        def sync(file: int) -> None:
+            if self.refuses:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            synced(file)
+
+        os.fdatasync = sync
+        notices.disk_space = lambda folder: space(folder)._replace(**({"free_bytes": 0} if self.is_full else {}))
+
+
 class Schedule:
     """What people do, in its order."""
 
     def __init__(self, case: Case, folder: Path, life: int) -> None:
-        self.case, self._folder = case, folder
+        self.case, self._folder, self.disk = case, folder, Disk()
         self._doors = (folder / f"doors-{life}.jsonl").open("w")
 
     async def run(self, clock: VirtualClock) -> None:
@@ -105,6 +125,8 @@ class Schedule:
             case "stop" | "interrupt":
                 self._note(order, now_ns, None)
                 os.kill(os.getpid(), _SIGNALS[order.verb])
+            case "lose_folder" | "find_folder" | "fill_disk" | "empty_disk" | "refuse_writes" | "take_writes":
+                self._note(order, now_ns, self._change_disk(order.verb, session))
             case "switch_on" | "switch_off":
                 self._note(order, now_ns, self._second_master(order))
             case "state":
@@ -125,6 +147,18 @@ class Schedule:
                 self._note(order, now_ns, self._asked(session, "POST", f"sessions/{name}/notes", body))
             case _:
                 self._note(order, now_ns, self._asked(session, "POST", f"run/{order.verb}", {}))
+
+    def _change_disk(self, verb: str, session: Path | None) -> bool:
+        """Whether it could be done."""
+        if verb == "lose_folder" and session is not None:
+            session.rename(self._folder / HIDDEN / session.name)
+        elif verb == "find_folder":
+            return find_folder(self._folder)
+        elif verb in ("fill_disk", "empty_disk"):
+            self.disk.is_full = verb == "fill_disk"
+        else:
+            self.disk.refuses = verb == "refuse_writes"
+        return True
 
     def _note(self, order: Order, now_ns: int, answer: object) -> None:
         row = {"time_ns": now_ns, "verb": order.verb, "body": order.body, "answer": answer}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import tempfile
 from collections import Counter
@@ -17,7 +18,8 @@ from tests.torture.lives import Life, live
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of a case. simulated_s: over all lives. events, rules of the guard: how often each was recorded."""
+    """What came of a case. simulated_s: over all lives. events, rules of the guard,
+    entries of the journal: how often each was recorded."""
 
     case: Case
     lives: tuple[Life, ...]
@@ -25,6 +27,7 @@ class Result:
     simulated_s: float
     events: Counter[str]
     rules: Counter[str]
+    entries: Counter[str]
 
     @property
     def broken(self) -> set[str]:
@@ -32,8 +35,9 @@ class Result:
         return {each.rule for each in self.violations}
 
 
-def perform(case: Case, folder: Path | None = None) -> Result:
-    """Run a case and look at it; without a folder nothing is left of it."""
+def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> Result:
+    """Run a case and look at it; without a folder nothing is left of it. twice: one without kills must leave the same
+    bytes again."""
     place = folder or Path(tempfile.mkdtemp(prefix="torture-"))
     try:
         evidence = Evidence(case, place, live(case, place))
@@ -41,16 +45,34 @@ def perform(case: Case, folder: Path | None = None) -> Result:
         events = Counter(said.kind for said in evidence.said)
         trips = [said for said in evidence.said if said.kind.startswith("guard.") and "rule" in said.data]
         rules = Counter(str(said.data["rule"]) for said in trips)
+        entries = Counter(str(each["entry"]) for each in evidence.journal)
         found = tuple(violations(evidence))
-        return Result(case, tuple(evidence.lives), found, sum(spans_ns) / 1e9, events, rules)
+        if twice and not case.kills_s and all(life.status is not None for life in evidence.lives):
+            found += tuple(_differing(case, place))
+        return Result(case, tuple(evidence.lives), found, sum(spans_ns) / 1e9, events, rules, entries)
     finally:
         if folder is None:
             shutil.rmtree(place, ignore_errors=True)
 
 
+def _differing(case: Case, folder: Path) -> Iterator[Violation]:
+    first = _digests(folder)
+    live(case, folder)
+    second = _digests(folder)
+    differing = sorted(name for name in first.keys() | second.keys() if first.get(name) != second.get(name))
+    if differing:
+        yield Violation("is_the_same_twice", f"not the same twice: {', '.join(differing[:6])}", len(differing))
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Of the session's files."""
+    files = [path for path in folder.glob("out/*/**/*") if path.is_file()]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
 def perform_seed(seed: int) -> Result:
-    """The case of a seed."""
-    return perform(draw(seed))
+    """The case of a seed; each eighth twice."""
+    return perform(draw(seed), twice=seed % 8 == 0)
 
 
 def shrunk(case: Case, rules: set[str], tries: int) -> Case:

@@ -143,7 +143,7 @@ def test_a_broken_case_is_shrunk_to_what_breaks_it(monkeypatch: pytest.MonkeyPat
 
     faults = tuple(Fault(name, True, 5.0, 60.0) for name in ("bus.cut", "flap.jam", "flap.stall", "camera.deaf"))
     case = replace(draw(3), faults=faults, orders=(Order("pause", 3.0),), kills_s=(9.0,))
-    monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter()))
+    monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter(), Counter()))
     monkeypatch.setattr(rig.Result, "broken", property(lambda self: is_broken(self.case)))
     least = shrunk(case, {"x"}, 200)
     assert [fault.name for fault in least.faults] == ["flap.jam"]

@@ -1,0 +1,65 @@
+"""What cases have reached of all that there is, so that what is never reached is seen."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from stand.running.memory import entries
+from tests.torture.case import KINDS, ORDERS
+from tests.torture.lives import ROOT
+from tests.torture.rig import Result
+
+_RULE = re.compile(r"\bFault\(\s*\"([a-z_]+)\"")
+_EVENT = re.compile(r"(?:Event|Notice)\([^\"]*\"(?:info|warning|error)\",\s*\"([a-z_.]+)\"")
+
+
+class Reached:
+    """How often each was: kinds of faults and orders, rules of the guard, kinds of events, entries of the journal, and
+    ends of the program."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, Counter[str]] = {
+            name: Counter() for name in ("kinds", "rules", "events", "entries", "ends")
+        }
+
+    def add(self, result: Result) -> None:
+        """What a case has reached."""
+        case, counts = result.case, self.counts
+        counts["kinds"].update(fault.name for fault in case.faults)
+        counts["kinds"].update(order.verb for order in case.orders)
+        counts["kinds"].update({"kill": len(case.kills_s)})
+        counts["rules"].update(result.rules)
+        counts["events"].update(result.events)
+        counts["entries"].update(result.entries)
+        counts["ends"].update(str(life.status) for life in result.lives)
+
+    def told(self) -> Iterator[str]:
+        """Two lines for each: what was, and what was not."""
+        known = everything()
+        for name, counts in self.counts.items():
+            yield f"{name}: {', '.join(f'{each} {number}' for each, number in counts.most_common())}"
+            if missing := sorted(set(known.get(name, ())) - counts.keys()):
+                yield f"{name} never reached ({len(missing)} of {len(known[name])}): {', '.join(missing)}"
+
+
+def everything() -> Mapping[str, set[str]]:
+    """All that there is, as the sources name it."""
+    own = [
+        each.__name__ for _, each in inspect.getmembers(entries, inspect.isclass) if each.__module__ == entries.__name__
+    ]
+    return {
+        "kinds": {*KINDS, *ORDERS, "kill"},
+        "rules": set(_named(_RULE, ("stand",))),
+        "events": set(_named(_EVENT, ("stand", "recording"))),
+        "entries": set(own),
+    }
+
+
+def _named(pattern: re.Pattern[str], packages: Iterable[str]) -> Iterator[str]:
+    for package in packages:
+        for path in Path(ROOT / package).rglob("*.py"):
+            yield from pattern.findall(path.read_text(encoding="utf-8"))
