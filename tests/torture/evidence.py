@@ -5,6 +5,7 @@ how each life ended. Nothing of the guard, the recorder or the reader gets it: M
 from __future__ import annotations
 
 import json
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,11 +19,15 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from tests import forked
 from tests.torture.case import Case
 from tests.torture.laboratory import TRUTH
-from tests.torture.lives import COMPLETE, KILLED, Life
+from tests.torture.lives import COMPLETE, KILLED, ROOT, Life
 
 ROW = np.dtype([("time_ns", "<i8"), *((name, "<f8") for name in TRUTH)])
+
+GIVEN_UP = "segment_given_up"
+"""The event of a file that a disk has refused: it stays unfinished, and is salvaged when the run has ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +82,15 @@ class Evidence:
     def __post_init__(self) -> None:
         self.stand = yaml.safe_load((self.folder / "stand.yaml").read_text())
         self.session = next(iter(sorted((self.folder / "out").glob("*/journal.jsonl"))), self.folder / "none/x").parent
+        self._read_all()
+        if self.is_complete and any(said.kind == GIVEN_UP for said in self.said):
+            for found in (self.unreadable, self.said, self.marks, self.frames, self.metas, self.temperatures):
+                found.clear()
+            program = [sys.executable, "-m", "stand.cli", "session", "salvage", str(self.session)]
+            forked.run(program, cwd=ROOT, capture_output=True)
+            self._read_all()
+
+    def _read_all(self) -> None:
         for path in sorted(self.session.glob("*/*.mcap*")):
             if path.suffix in (".mcap", ".part"):
                 self._read(path)
@@ -143,6 +157,10 @@ class Evidence:
     def ordered(self, at_s: float, verb: str, within_s: float) -> bool:
         """Whether somebody did that not within_s before."""
         return any(each.verb == verb and 0 <= at_s - each.at_s <= within_s for each in self.case.orders)
+
+    def killed_soon(self, at_s: float, within_s: float) -> bool:
+        """Whether the program was killed not within_s after."""
+        return any(0 <= kill_s - at_s <= within_s for kill_s in self.case.kills_s)
 
     def _bus(self, number: int) -> Iterator[Exchange]:
         path = self.folder / f"wire-{number}.jsonl"

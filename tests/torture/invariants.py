@@ -24,6 +24,8 @@ HOLD_S, STALE_S, LOOK_S = 15.0, 15.0, 5.0
 STEP_S = 0.5  # of the plant: what is switched within a step acts from its begin on
 MIN_OFF_S = 300.0
 FLAP_SHUT_S = 60.0
+DURABLE_S = 15.0  # what is younger may be lost by a kill
+LONGEST_GAP_S, PROBED_S = 30.0, 60.0  # between readings; of how long a device is not asked that was lost
 MOST_AN_HOUR = 6
 RELAYS_UNIT, TIMED_ON = 2, 0x0200
 STATUSES = (COMPLETE, 1, 4, 130, KILLED)
@@ -260,6 +262,37 @@ def readings_are_true(evidence: Evidence) -> Iterator[str]:
                 continue
             if abs(value - (true := float(row[_TRUE[name]]))) > _SENSOR_K:
                 yield f"{name} was read as {value:.2f} degC at {at_s} s, and is {true:.2f} degC"
+
+
+@invariant
+def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
+    """A temperature that HTTP showed is in the recording, but for the last ones before a kill."""
+    if not evidence.is_complete or any("lost" in said.kind or "dropped" in said.kind for said in evidence.said):
+        return
+    recorded = {(name, row[0]): row[1] for name, rows in evidence.temperatures.items() for row in rows}
+    for row in (row for doors in evidence.doors for row in doors):
+        readings = row["answer"].get("readings", {}) if isinstance(row["answer"], dict) else {}
+        for channel, shown in readings.items():
+            device, _, name = channel.partition(".")
+            if device != "thermometers" or shown["unit"] != "degC" or shown["quality"] != "good":
+                continue
+            at_s, value = evidence.at_s(shown["time_ns"]), recorded.get((name, shown["time_ns"]))
+            if (value is None or abs(value - shown["value"]) > 1e-6) and not evidence.killed_soon(at_s, DURABLE_S):
+                yield f"HTTP showed {channel} {shown['value']:.3f} of {at_s} s, the recording has {value}"
+
+
+@invariant
+def readings_go_on(evidence: Evidence) -> Iterator[str]:
+    """The air is recorded from the first reading of a life to its last, also where it cannot be read."""
+    times_ns = np.array([row[0] for row in evidence.temperatures.get("air", ())], dtype=np.int64)
+    for truth in evidence.truth if evidence.is_complete else ():
+        if not len(truth):
+            continue
+        own = np.unique(times_ns[(times_ns >= truth["time_ns"][0]) & (times_ns <= truth["time_ns"][-1])])
+        for place in np.flatnonzero(np.diff(own) > LONGEST_GAP_S * 1e9):
+            at_s = evidence.at_s(int(own[place]))
+            if not evidence.excused(at_s + LONGEST_GAP_S, "bus", "thermometers", after_s=PROBED_S):
+                yield f"no reading of the air for {(own[place + 1] - own[place]) / 1e9:.0f} s from {at_s} s on"
 
 
 @invariant
