@@ -190,10 +190,11 @@ def _plan(drawn: random.Random, stand: dict[str, str]) -> tuple[dict[str, list[A
         points = {"temperatures_degC": [24, drawn.randrange(low, 42) + 0.5], "positions": spots, "dwell_s": dwell_s}
         points |= {"equilibrium_s": dwell_s, "reference_frames": 1, "frames_per_position": 1}
         return {"experiments": [{"validation": points}]}, 1500.0 + 2 * dwell_s
-    steps: list[Any] = ["close_flap", {"start_chamber": 26}, {"soak": drawn.choice((120, 600))}]
-    duration_s = 700.0
+    soaks_s = drawn.choice(((120, 300, 600), (600, 1800, 3000)))  # a short plan finds most of what a long one does
+    steps: list[Any] = ["close_flap", {"start_chamber": 26}, {"soak": soaks_s[0]}]
+    duration_s = 150.0 + soaks_s[0]
     for _ in range(drawn.randint(1, 4)):
-        soak_s = drawn.choice((120, 600, 1800, 3000))
+        soak_s = drawn.choice(soaks_s)
         settles = has_camera and soak_s >= 1800 and drawn.random() < 0.5
         steps += [{"set_temperature": drawn.randrange(low, 46)}]
         steps += [{"soak_until_settled": {"max_s": soak_s}} if settles else {"soak": soak_s}]
