@@ -35,7 +35,7 @@ test: setup
 		wait $$types || { echo "pyright has found errors, see above"; exit 1; }; exit $$tests
 
 nightly: setup
-	@sh .ci/system-packages $(PEER_PACKAGES)
+	@sh .ci/system-packages $(PEER_PACKAGES) spin
 	$(BIN)/pytest -m "nightly or hypothesis" --hypothesis-profile=night -o faulthandler_timeout=5400
 	$(BIN)/python -m tests.torture --minutes 30 --jobs $(shell nproc) --shrink 40
 
