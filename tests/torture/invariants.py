@@ -3,6 +3,7 @@ violation; `@invariant` enters it."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import sys
@@ -285,10 +286,9 @@ def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
 def readings_go_on(evidence: Evidence) -> Iterator[str]:
     """The air is recorded from the first reading of a life to its last, also where it cannot be read."""
     times_ns = np.array([row[0] for row in evidence.temperatures.get("air", ())], dtype=np.int64)
-    for truth in evidence.truth if evidence.is_complete else ():
-        if not len(truth):
-            continue
-        own = np.unique(times_ns[(times_ns >= truth["time_ns"][0]) & (times_ns <= truth["time_ns"][-1])])
+    begins_ns = [int(truth["time_ns"][0]) for truth in evidence.truth if len(truth)] if evidence.is_complete else []
+    for begin_ns, end_ns in itertools.pairwise([*begins_ns, sys.maxsize]):
+        own = np.unique(times_ns[(times_ns >= begin_ns) & (times_ns < end_ns)])
         for place in np.flatnonzero(np.diff(own) > LONGEST_GAP_S * 1e9):
             at_s = evidence.at_s(int(own[place]))
             if not evidence.excused(at_s + LONGEST_GAP_S, "bus", "thermometers", after_s=PROBED_S):
