@@ -39,6 +39,7 @@ from tests.bench import (
     regulators,
     simulator,
     start,
+    stop,
     viewers,
     virtual_time,
     warp,
@@ -77,6 +78,7 @@ BENCHMARKS = {
     "identification": identification.figures,
     "simulator": simulator.figures,
     "start": start.figures,
+    "stop": stop.figures,
     "page": page.figures,
 }
 
