@@ -24,7 +24,7 @@ from stand.serving.secop.door import door_at
 from tests.asking import ask
 from tests.nightly import by_night
 from tests.stand.a_desk import ADesk, served
-from tests.stand.floods import FLOODS
+from tests.stand.floods import FLOODS, PING, VIEW
 from tests.stand.test_interface_access import book, free_port
 
 LIMIT_S = 5.0
@@ -160,6 +160,16 @@ async def test_who_may_not_stop_is_told_why(tmp_path: Path):
         assert desk.orders == []
         assert (await asyncio.to_thread(post, port))[0] == 200
     assert [who.how for who, _, _ in desk.orders] == ["network"]
+
+
+async def test_a_viewer_that_speaks_before_it_is_let_in_is_left_without_a_failure(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    async with open_stand(tmp_path) as (_, port):
+        with contextlib.suppress(ConnectionResetError):
+            assert await asyncio.to_thread(said, port, VIEW + PING * 1000) == b""
+        assert (await asyncio.to_thread(server_of(tmp_path / "night").state)).stand == "a stand"
+    assert caplog.records == []
 
 
 async def test_every_answer_over_the_network_ends_its_connection_so_that_stop_is_the_first_of_its_own(tmp_path: Path):

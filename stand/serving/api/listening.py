@@ -72,7 +72,8 @@ class _Client(H11Protocol):
                 return
             super().data_received(data[begin : begin + _PIECE_BYTES])
             if self.transport.get_protocol() is not self:  # it is a viewer from here on
-                self.transport.get_protocol().data_received(data[begin + _PIECE_BYTES :])  # pyright: ignore[reportAttributeAccessIssue]
+                if rest := data[begin + _PIECE_BYTES :]:
+                    self.transport.get_protocol().data_received(rest)  # pyright: ignore[reportAttributeAccessIssue]
                 return
 
     @property
@@ -101,10 +102,13 @@ class _Viewer(WebSocketsSansIOProtocol):
     _has_asked = False
 
     def data_received(self, data: bytes) -> None:
-        """As ever, within the budget; the first is the request."""
+        """As ever, within the budget; the first is the request, and until it is answered there is nothing to say."""
         now_s = self.loop.time()
         if not self._has_asked:
             self._has_asked, self._budget_bytes = True, float(_VIEWER_BURST_BYTES)
+        elif not self.handshake_complete:
+            self.transport.abort()
+            return
         else:
             earned_bytes = (now_s - self._heard_s) * _VIEWER_BYTES_PER_S
             self._budget_bytes = min(self._budget_bytes + earned_bytes, _VIEWER_BURST_BYTES)
