@@ -64,6 +64,17 @@ def held(said: bytes, count: int = 40) -> None:
             clients[-1].sendall(said)
 
 
+def crowded(count: int = 200) -> None:
+    """Connections without waiting for one of them."""
+    clients = [socket.socket() for _ in range(count)]
+    for client in clients:
+        client.setblocking(False)
+        client.connect_ex(("127.0.0.1", PORT))
+    threading.Event().wait(0.01)
+    for client in clients:
+        client.close()
+
+
 def dripped(said: bytes) -> None:
     """Many connections that say a little now and then."""
     clients = [connected() for _ in range(40)]
@@ -111,6 +122,7 @@ FLOODS: dict[str, tuple[int, Callable[[], None]]] = {
     "answers nobody reads": (16, lambda: unread(SCHEMA * 200)),
     "half heads": (8, lambda: held(STOP)),
     "silent connections": (8, lambda: held(b"")),
+    "connections by the thousand": (8, crowded),
     "slow loris": (4, lambda: dripped(STOP + b"X")),
     "requests": (100, lambda: asked(STATE)),
     "pipelined requests": (16, lambda: asked(STATE * 200)),

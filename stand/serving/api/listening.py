@@ -37,7 +37,7 @@ _NO_DESCRIPTOR_PAUSE_S = 0.1
 _ASK_WITHIN_S = 10.0  # a whole request's head, from the first moment or the answer before
 _IDLE_LIMIT_S = 60.0
 _FAREWELL_LIMIT_S = 1.0  # for clients that do not read their last answer
-_BACKLOG = 1024  # of whom it overflows, a connection is tried again by the kernel after 1 s
+_BACKLOG = 4096  # who finds no place in it is tried again by the kernel after 1 s
 _PIECE_BYTES = 4096  # of what a client sends, looked at before more of it is taken apart
 # A browser answers a ping each 20 s with 10 bytes. A read counts as 64 bytes at least: eight a second, 64 at once.
 _VIEWER_BYTES_PER_S, _VIEWER_BURST_BYTES, _LEAST_BYTES = 512, 4096, 64

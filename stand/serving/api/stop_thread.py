@@ -30,9 +30,9 @@ from stand.serving.desk import Done, Who
 Door = Literal["stop", "tcp"]
 Stopping = Callable[[Who], "concurrent.futures.Future[Done]"]
 
-_MOST_CLIENTS = 128  # of a door, who have not been answered or handed over
+_MOST_CLIENTS = 128  # of a door, before _AT_ONCE more are let in, who have not been answered or handed over
 _MOST_OTHERS = 64  # handed over, and not taken yet
-_AT_ONCE = 16
+_AT_ONCE = 128
 _REST_S = 0.01  # at most, however much is asked of this thread
 _MAY_SPEAK_S = 0.02  # between connecting and speaking, on a busy machine: who is younger is not sent away
 _HEAD_BYTES = 1 << 15
@@ -118,11 +118,13 @@ class _Client:
         self.came_s = now_s
         self.until_s = now_s + _ASK_WITHIN_S
         self.answer: concurrent.futures.Future[Done] | None = None
+        self.has_spoken = False
         self.has_answer = False
 
     def may_leave(self, now_s: float) -> bool:
-        """Whether it makes room for another."""
-        return self.has_answer or (self.answer is None and now_s > self.came_s + _MAY_SPEAK_S)
+        """Whether it makes room for another; a STOP is said as a whole, by all but those who drip."""
+        has_time = not self.has_spoken and now_s < self.came_s + _MAY_SPEAK_S
+        return self.has_answer or (self.answer is None and not has_time)
 
     def scope(self, request: h11.Request) -> Scope:
         """Its request, as the gatekeeper gets it."""
@@ -234,10 +236,10 @@ class StopThread:
         self._epoll.register(listening, select.EPOLLIN)
 
     def _accept(self, door: Door, listening: socket.socket) -> None:
+        if not self._has_room(door):
+            self._is_crowded = True
+            return
         for _ in range(_AT_ONCE):
-            if not self._has_room(door):
-                self._is_crowded = True
-                return
             try:
                 connection, _ = listening.accept()
             except BlockingIOError:
@@ -258,13 +260,14 @@ class StopThread:
 
     def _has_room(self, door: Door) -> bool:
         clients = [each for each in self._clients.values() if each.door == door]
-        if len(clients) < _MOST_CLIENTS:
-            return True
-        now_s = time.monotonic()
-        leaving = [each for each in clients if each.may_leave(now_s)]
-        if leaving:
-            self._drop(min(leaving, key=lambda each: (not each.has_answer, each.came_s)))
-        return bool(leaving)
+        excess, now_s = len(clients) - _MOST_CLIENTS + 1, time.monotonic()
+        if excess > 0:
+            leaving = [each for each in clients if each.may_leave(now_s)]
+            leaving.sort(key=lambda each: (not each.has_answer, each.came_s))
+            for each in leaving[:excess]:
+                self._drop(each)
+            excess -= len(leaving)
+        return excess <= 0
 
     def _make_room(self) -> bool:
         """Whether there is a descriptor now, which there was not."""
@@ -290,11 +293,12 @@ class StopThread:
             self._answer(client, last_refusal(500, FAILED.format(type(error).__name__)))
 
     def _understand(self, client: _Client, said: bytes) -> None:
+        client.has_spoken = True
         if not said:
             self._drop(client)
         elif said[: len(_REQUEST)] != _REQUEST[: len(said)]:
             self._hand_over(client)
-        elif len(said) >= len(_REQUEST):
+        elif b"\n\r\n" in said or b"\n\n" in said or len(said) == _HEAD_BYTES:
             parser = h11.Connection(h11.SERVER, max_incomplete_event_size=_HEAD_BYTES - 1)
             parser.receive_data(said)
             try:
