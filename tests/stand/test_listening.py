@@ -13,10 +13,11 @@ import pytest
 
 from stand.serving.api.listening import MOST_CLIENTS
 from stand.serving.api.pace import Pace
-from stand.serving.client import server_of
+from stand.serving.client import server_at, server_of
 from stand.serving.presence import address_in, living, opened_folder
 from tests.asking import ask
 from tests.stand.a_desk import ADesk, served
+from tests.stand.test_interface_access import free_port
 
 STATE = b"GET /api/v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
 LOOKS, PERIOD_S = 60, 0.02
@@ -149,6 +150,7 @@ async def test_a_client_that_asks_and_never_reads_is_not_waited_for(tmp_path: Pa
 DAEMON = """
 import asyncio, os, resource, sys
 from pathlib import Path
+from stand.serving.api.doors import Interface
 from stand.serving.desk import Done
 from tests.stand.a_desk import ADesk, served
 
@@ -171,7 +173,8 @@ def take_all():
 async def run():
     global ended
     ended = asyncio.Event()
-    async with served(Desk(), Path(sys.argv[1])):
+    folder, port = Path(sys.argv[1]), int(sys.argv[2])
+    async with served(Desk(), folder, Interface(folder.parent, port=port)):
         print("ready", flush=True)
         await asyncio.to_thread(sys.stdin.readline)
         take_all()
@@ -186,7 +189,8 @@ print("ended", flush=True)
 
 def test_a_daemon_without_a_descriptor_left_still_answers(tmp_path: Path):
     with contextlib.ExitStack() as stack:
-        command = [sys.executable, "-c", DAEMON, tmp_path]
+        port = free_port()
+        command = [sys.executable, "-c", DAEMON, tmp_path, str(port)]
         daemon = stack.enter_context(
             subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         )
@@ -206,7 +210,10 @@ def test_a_daemon_without_a_descriptor_left_still_answers(tmp_path: Path):
         silent[0].settimeout(5.0)
         with silent[0].makefile("rb") as answers:
             assert b"no descriptor left" in answers.read()
-        assert ask(tmp_path, "stop")["verb"] == "stop"
+        for _ in range(20):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port), 5.0))
+        assert server_at(f"http://127.0.0.1:{port}").order("pause", timeout_s=30.0)["moving"]
+        assert server_at(f"http://127.0.0.1:{port}").order("stop")["verb"] == "stop"
         assert daemon.stdout.readline() == "ended\n"
 
 

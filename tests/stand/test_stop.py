@@ -20,6 +20,7 @@ from foundation.items import Event
 from stand.serving.api.doors import Interface
 from stand.serving.api.stop_thread import StopThread
 from stand.serving.client import server_of
+from stand.serving.desk import Done, Who
 from stand.serving.secop.door import door_at
 from tests.asking import ask
 from tests.nightly import by_night
@@ -170,6 +171,28 @@ async def test_a_viewer_that_speaks_before_it_is_let_in_is_left_without_a_failur
             assert await asyncio.to_thread(said, port, VIEW + PING * 1000) == b""
         assert (await asyncio.to_thread(server_of(tmp_path / "night").state)).stand == "a stand"
     assert caplog.records == []
+
+
+@pytest.mark.parametrize("way", ["over TCP", "from the command line"])
+async def test_a_stop_that_ends_the_daemon_is_answered(tmp_path: Path, way: str):
+    ended = asyncio.Event()
+
+    class Ending(ADesk):
+        def stop(self, who: Who) -> Done:
+            ended.set()
+            return super().stop(who)
+
+    port = free_port()
+
+    def stop() -> Any:
+        return post(port)[1]["verb"] if way == "over TCP" else ask(tmp_path / "night", "stop")["verb"]
+
+    async with served(Ending(), tmp_path / "night", Interface(tmp_path, port=port)):
+        stopping = asyncio.create_task(asyncio.to_thread(stop))
+        await ended.wait()
+    assert await stopping == "stop"
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.to_thread(post, port)
 
 
 async def test_every_answer_over_the_network_ends_its_connection_so_that_stop_is_the_first_of_its_own(tmp_path: Path):

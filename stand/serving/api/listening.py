@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import select
 import socket
 from collections.abc import Callable
 from contextlib import suppress
@@ -25,7 +24,7 @@ from websockets.frames import CloseCode
 
 from stand.serving.api.access import last_refusal, uid_of
 from stand.serving.api.pace import Pace
-from stand.serving.api.stop_thread import Others
+from stand.serving.api.stop_thread import Others, is_readable
 
 MOST_CLIENTS = 64  # a script that leaks connections must not take the files the recording needs
 _MOST_ASKING = 96  # when all of them wait for an answer
@@ -214,7 +213,7 @@ class Listening:
         listening = self._doors[door]
         pause_s = 0.0
         for _ in range(_AT_ONCE):
-            if not _is_readable(listening):  # without a descriptor the kernel refuses also when nobody waits
+            if not is_readable(listening):
                 break
             self._pace.is_crowded = not self._has_room()
             if self._pace.is_crowded:
@@ -294,12 +293,6 @@ def _hang_up(transport: asyncio.Transport, status: int, sentence: str) -> None:
     """The reason, as far as the client takes it, and the end."""
     transport.write(last_refusal(status, sentence))
     transport.close()
-
-
-def _is_readable(listening: Door) -> bool:
-    poll = select.poll()  # select.select takes no descriptor above 1023
-    poll.register(listening, select.POLLIN)
-    return bool(poll.poll(0))
 
 
 def listening_at(host: str, port: int) -> socket.socket:

@@ -9,7 +9,6 @@ nothing makes room for the next.
 from __future__ import annotations
 
 import concurrent.futures
-import errno
 import os
 import select
 import socket
@@ -53,6 +52,7 @@ class Others:
         self._lock = threading.Lock()
         self._spares: list[int] = []
         self._is_open = True
+        self.keep_spares()
 
     def fileno(self) -> int:
         """Readable while one waits."""
@@ -106,6 +106,13 @@ class Others:
         """OSError when there is no descriptor for one."""
         while self._is_open and len(self._spares) < _SPARES:
             self._spares.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+
+
+def is_readable(listening: socket.socket | Others) -> bool:
+    """Whether somebody waits there: without a descriptor the kernel refuses also when nobody does."""
+    poll = select.poll()  # select.select takes no descriptor above 1023
+    poll.register(listening, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 class _Client:
@@ -246,8 +253,10 @@ class StopThread:
                 return
             except (InterruptedError, ConnectionAbortedError):
                 continue
-            except OSError as error:
-                if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM) and self._make_room():
+            except OSError:  # no descriptor left, or no memory
+                if not is_readable(listening):
+                    return
+                if self._make_room():
                     continue
                 self._is_crowded = True
                 return
