@@ -87,6 +87,11 @@ class _Client(H11Protocol):
         _hang_up(self.transport, 400, "this is no HTTP request, or its head is longer than 32 KiB")
 
     @property
+    def has_spoken(self) -> bool:
+        """Whether there is something to read."""
+        return is_readable(self.transport.get_extra_info("socket"))
+
+    @property
     def is_answering(self) -> bool:
         """Whether it waits for an answer."""
         return self.cycle is not None and not self.cycle.response_complete  # pyright: ignore[reportUnnecessaryComparison]
@@ -259,8 +264,9 @@ class Listening:
         if self.clients < MOST_CLIENTS:
             return True
         silent = [client for client in self._silent() if not client.is_answering]
-        if silent and (len(silent) > _MOST_SILENT or self._loop.time() - silent[0].heard_s > _MAY_SPEAK_S):
-            return self._send_away(f"{MOST_CLIENTS} clients are connected, and you were silent longest")
+        may_leave = silent and (len(silent) > _MOST_SILENT or self._loop.time() - silent[0].heard_s > _MAY_SPEAK_S)
+        if may_leave and self._send_away(silent, f"{MOST_CLIENTS} clients are connected, and you were silent longest"):
+            return True
         return self.clients < _MOST_ASKING
 
     def _make_room(self) -> bool:
@@ -268,14 +274,14 @@ class Listening:
         if self._spares:
             os.close(self._spares.pop())
             return True
-        return self._send_away("the daemon has no descriptor left, and you were silent longest")
+        return self._send_away(self._silent(), "the daemon has no descriptor left, and you were silent longest")
 
-    def _send_away(self, sentence: str) -> bool:
-        """Disconnect the client that was silent longest, with the reason as far as it takes it; viewers stay."""
-        silent = self._silent()
-        if not silent:
+    def _send_away(self, silent: list[_Client], sentence: str) -> bool:
+        """Disconnect the first of these, with the reason as far as it takes it, but for those who have spoken when this
+        thread had no time to hear it."""
+        client = next((each for each in silent if each.is_answering or not each.has_spoken), None)
+        if client is None:
             return False
-        client = silent[0]
         if not client.is_answering:
             _hang_up(client.transport, 503, sentence)
         else:
