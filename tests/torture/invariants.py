@@ -199,7 +199,8 @@ def _acting(evidence: Evidence, truth: np.ndarray, name: str, begin_ns: int, end
         drives = ("chamber",)
     elif name == "heater_enabled" and "relays" not in evidence.stand:
         return
-    for row in truth[(truth["time_ns"] > begin_ns) & (truth["time_ns"] < end_ns) & (truth[name] > 0.01)]:
+    is_within = (truth["time_ns"] > begin_ns) & (truth["time_ns"] < end_ns - int(STEP_S * 1e9))
+    for row in truth[is_within & (truth[name] > 0.01)]:
         at_s = evidence.at_s(int(row["time_ns"]))
         if not evidence.excused(at_s, *drives, after_s=60.0) and not evidence.ordered(at_s, "switch_on", 40.0):
             yield f"{name} is {row[name]:.2g} at {at_s} s, in {when}"
