@@ -98,8 +98,8 @@ class CameraSupply:
 
     async def restore(self) -> None:
         """After the equilibrium was lost: the supply on, should it be off, and the camera open; tried for 30 min, the
-        gate being held."""
-        if self.is_on:
+        gate being held. Nothing on a stand without cameras."""
+        if self.is_on or not self._cameras.names:
             return
         deadline_ns = self._clock.now_ns() + seconds_ns(LOST_LIMIT_S)
         self._gate.hold(CAMERA_LOST)

@@ -297,6 +297,8 @@ class Guest:
 def _judge_camera(before: Interruption, assembly: Assembly) -> None:
     """A camera that the plan has on, and that may have been off since, has lost its equilibrium."""
     stand, boot = assembly.stand, boot_of(assembly.clock)
+    if not assembly.devices.cameras:
+        return
     if not before.kept.set_up.camera_on:
         stand.imaging.supply.last = before.camera.last
     elif reason := doubt(
