@@ -206,7 +206,8 @@ class Simulator:
         if not line:
             reason = self._process.stderr.read().strip().splitlines()
             self.stop()
-            raise ConfigError(f"the simulator did not start: {reason[-1] if reason else 'it said nothing'}")
+            ended = f"it said nothing and ended with status {self._process.returncode}"
+            raise ConfigError(f"the simulator did not start: {reason[-1] if reason else ended}")
         self.addresses: dict[str, str] = json.loads(line)
 
     def stop(self) -> None:

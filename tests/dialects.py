@@ -153,6 +153,29 @@ BIT_OF_SELECTED = (
     + register("TriggerBits", 0xB00C)
 )
 
+# As AVT's Mako U: what is written is in steps that a register of the camera tells.
+STEPPED = (
+    '<Float Name="ExposureTime"><pValue>InSteps</pValue><Unit>us</Unit></Float>\n'
+    '<Converter Name="InSteps"><pVariable Name="M">LeastReg</pVariable><pVariable Name="I">StepReg</pVariable>'
+    "<FormulaTo>M + I * TRUNC((FROM * 1000 - M + I / 2) / I)</FormulaTo><FormulaFrom>TO * 0.001</FormulaFrom>"
+    "<pValue>InStepsReg</pValue></Converter>\n"
+    + register("InStepsReg", 0xA050, length=8)
+    + register("LeastReg", 0xA0B0, "RO", length=8)
+    + register("StepReg", 0xA0B8, "RO", length=8)
+)
+# As Hikrobot's: what a command writes is the selector's value, which the client has.
+COMMAND_OF_SELECTED = (
+    '<Enumeration Name="TriggerSelector"><EnumEntry Name="AcquisitionStart"><Value>0</Value></EnumEntry>'
+    '<EnumEntry Name="FrameStart"><Value>3</Value></EnumEntry><pValue>Selected</pValue></Enumeration>\n'
+    + '<Integer Name="Selected"><Value>0</Value></Integer>\n'
+    + choice("TriggerMode", 0xB004, MODE)
+    + SOURCE
+    + '<Command Name="TriggerSoftware"><pValue>SoftwareReg</pValue><pCommandValue>Selected</pCommandValue></Command>\n'
+    + register("SoftwareReg", 0xB010, "WO")
+)
+# As IDS' USB3 cameras: registers where GigE Vision has its bootstrap registers.
+LOW = IMAGE.replace("0xa0", "0x2") + choice("AcquisitionMode", 0x218, {"SingleFrame": 0, "Continuous": 2})
+
 
 @dataclass(frozen=True)
 class Dialect:
@@ -199,6 +222,11 @@ DIALECTS = {
     ),
     "selected": Dialect(STANDARD + SELECTED + EXPOSURE, used="ExposureTime, , FrameStart Software"),
     "ticks of a clock": Dialect(STANDARD + BIT_OF_SELECTED + BASE, used="ExposureTimeAbs, , FrameStart Software"),
+    "steps of a register": Dialect(STANDARD + TRIGGER + SOURCE + STEPPED, used="ExposureTime, , Software"),
+    "command of a selector": Dialect(
+        STANDARD + COMMAND_OF_SELECTED + EXPOSURE, used="ExposureTime, , FrameStart Software"
+    ),
+    "low registers": Dialect(LOW + ACQUISITION + TRIGGER + SOURCE + EXPOSURE, used="ExposureTime, , Software"),
     "whole us": Dialect(
         STANDARD + TRIGGER + integer("ExposureTimeAbs", 0xA050) + integer("CurrentTemperature", 0xA060),
         used="ExposureTimeAbs, , TriggerSoftware",

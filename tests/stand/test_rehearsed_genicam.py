@@ -57,6 +57,18 @@ async def test_what_the_rehearsal_cannot_play_is_not_said_of_the_camera(tmp_path
     assert (reported.unplayed, reported.is_played) == (("TriggerSoftware",), False)
 
 
+async def test_an_entry_that_no_register_offers_is_not_said_of_the_camera(tmp_path: Path):
+    require_aravis()
+    file, text = tmp_path / "camera.xml", DIALECTS["abs"].xml("never").decode()
+    never = (
+        '<IntSwissKnife Name="Never"><pVariable Name="A">WidthReg</pVariable><Formula>A * 0</Formula></IntSwissKnife>'
+    )
+    text = text.replace('<EnumEntry Name="Mono8">', '<EnumEntry Name="Mono8"><pIsImplemented>Never</pIsImplemented>')
+    file.write_text(text.replace('<Integer Name="Width">', never + '<Integer Name="Width">'))
+    reported = await rehearse(file)
+    assert (reported.unplayed, reported.is_played) == (("PixelFormat",), False)
+
+
 async def test_the_file_of_a_transport_layers_module_is_refused_by_a_sentence(tmp_path: Path):
     require_aravis()
     file, text = tmp_path / "stream.xml", DIALECTS["abs"].xml("stream").decode()
@@ -72,6 +84,7 @@ async def test_a_zipped_file_is_read(tmp_path: Path):
     file = tmp_path / "camera.zip"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("abs.xml", DIALECTS["abs"].xml("abs"))
+        archive.writestr("__MACOSX/._abs.xml", bytes(8))
     assert (await rehearse(file)).refusal == ""
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("readme.txt", "nothing")
@@ -82,10 +95,24 @@ async def test_a_zipped_file_is_read(tmp_path: Path):
         await rehearse(file)
 
 
-async def test_what_is_no_genicam_file_is_refused(tmp_path: Path):
-    file = tmp_path / "other.xml"
-    file.write_text("<html/>")
-    with pytest.raises(ConfigError, match="is no GenICam file"):
+ITSELF = '<Integer Name="Width"><pValue>A</pValue></Integer><Integer Name="A"><pValue>Width</pValue></Integer>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("<?xml", "<html/><?xml", "is no GenICam file"),
+        ("utf-8", "nobodys", "is no GenICam file: unknown encoding"),
+        ('<Integer Name="Width">', ITSELF + '<Integer Name="Width2">', "the value of its (Width|A) is made of itself"),
+        ("<Length>4<", "<Length>0<", "its WidthMaxReg has the Length 0, not 1 to 8 bytes"),
+        ("<CommandValue>1<", "<CommandValue>one<", "has the CommandValue 'one', no whole number"),
+    ],
+)
+async def test_what_is_no_cameras_genicam_file_is_refused(tmp_path: Path, old: str, new: str, said: str):
+    require_aravis()
+    file, text = tmp_path / "other.xml", DIALECTS["abs"].xml("other").decode()
+    file.write_text(text.replace(old, new))
+    with pytest.raises(ConfigError, match=said):
         await rehearse(file)
 
 

@@ -15,6 +15,8 @@ DISCOVERY_bytes = 0xF8
 
 _CAPABILITY = 0x0934
 _STREAM_CHANNELS = 0x0904
+BOOTSTRAP_bytes = 0x1000
+_NUMBER_bytes = 8
 _FEATURES_ADDRESS = 0x10000
 
 
@@ -38,7 +40,11 @@ class Registers:
             self._at.setdefault(feature.address, []).append(feature)
         self._xml, self._xml_address = xml or to_xml(table), xml_address
         xml_padded = self._xml + bytes(-len(self._xml) % 4)  # clients read whole words
-        self._segments = {0: bytearray(0x1000), _FEATURES_ADDRESS: bytearray(0x400), xml_address: bytearray(xml_padded)}
+        self._segments = {
+            0: bytearray(BOOTSTRAP_bytes),
+            _FEATURES_ADDRESS: bytearray(0x400),
+            xml_address: bytearray(xml_padded),
+        }
         self._write_bootstrap(address, serial)
         self.reset()
 
@@ -58,6 +64,7 @@ class Registers:
         }
         for offset, word in words.items():
             struct.pack_into(">I", self._segments[0], offset, word)
+        self._standing = dict.fromkeys((*words, _CAPABILITY), 4)
         url = f"Local:{XML_NAME};{self._xml_address:X};{len(self._xml):X}".encode()
         self._segments[0][0x0200 : 0x0200 + len(url)] = url
         self.offer_resend(True)
@@ -81,6 +88,15 @@ class Registers:
                 self._store(feature.address, data)
             elif feature.kind != "command":
                 self.put(feature.name, feature.default)
+
+    def is_bootstrap(self, address: int, count: int) -> bool:
+        """Whether a bootstrap register lies there that says something; texts, such as the description's URL, are read
+        whole and not by 4 or 8 bytes."""
+        if count > _NUMBER_bytes:
+            return address < BOOTSTRAP_bytes
+        features = {at: fields[0].length for at, fields in self._at.items() if at < BOOTSTRAP_bytes}
+        places = self._standing | features
+        return any(address < begin + length and begin < address + count for begin, length in places.items())
 
     # ------------------------------------------------------------------------------------------ seen from the camera
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from drivers.framing.aravis_library import AravisError
 from drivers.sim.gige import gvcp
-from drivers.sim.gige.camera_registers import Registers, largest
+from drivers.sim.gige.camera_registers import BOOTSTRAP_bytes, Registers, largest
 from drivers.sim.gige.genicam import Feature
 from drivers.sim.gige.genicam_file import GenicamFile
 from drivers.sim.gige.genicam_memory import Evaluated
@@ -21,7 +21,6 @@ from drivers.sim.gige.gvsp import PixelFormat
 from foundation.errors import ConfigError
 
 XML_ADDRESS = 0x7E000000  # no register of the makes known lies there
-_BOOTSTRAP_bytes = 0x1000
 
 # Ours from theirs, the first that the file has: names of the makes as their GenICam files give them.
 _NUMBERS = {
@@ -40,16 +39,19 @@ _PACED = ("FixedRate", "Freerun")  # sources of a trigger that is none
 
 
 class DressedRegisters(Registers):
-    """`table` is the camera's own, `file` what the client sees; sizes are those that the file allows."""
+    """`table` is the camera's own, `file` what the client sees; sizes are those that the file allows. ConfigError when
+    the file cannot be played."""
 
     def __init__(self, table: tuple[Feature, ...], address: str, serial: str, file: GenicamFile) -> None:
         names = {"DeviceVendorName": file.vendor, "DeviceModelName": file.model}
         dressed = tuple(replace(each, default=names.get(each.name, each.default)) for each in table)
         self._file = Evaluated(file)
         self._temperature_degC: float | None = None
-        self._commands = {name: self._command(name) for name in COMMANDS if name in file}
         self.unplayed: tuple[str, ...] = ()  # features that no value of their registers makes work
-        super().__init__(dressed, address, serial, file.xml, XML_ADDRESS)
+        try:
+            super().__init__(dressed, address, serial, file.xml, XML_ADDRESS)
+        except (AravisError, ArithmeticError, LookupError, ValueError) as error:  # whatever an odd file brings about
+            raise ConfigError(f"the rehearsal cannot play this file: {type(error).__name__} {error}") from error
 
     @property
     def binning(self) -> tuple[int, int]:
@@ -66,6 +68,7 @@ class DressedRegisters(Registers):
         super().reset()
         self._file.memory.restore({})
         self.unplayed = start_values(self._file, self.integer("WidthMax"), self.integer("HeightMax"))
+        self._commands = {name: self._command(name) for name in COMMANDS if name in self._file.file}
         self._temperature_degC = None
         self._wear()
         self.put("PayloadSize", self.integer("Width") * self.integer("Height"))
@@ -100,15 +103,16 @@ class DressedRegisters(Registers):
         return any(address < begin + length and begin < address + count for begin, length in places)
 
     def read(self, address: int, count: int) -> bytes:
-        """`count` bytes from `address`, zeros where nothing was written yet; Nack outside bootstrap and file."""
+        """`count` bytes from `address`, zeros where nothing was written yet. Registers of a file for another bus lie
+        among the bootstrap registers."""
         is_in_xml = XML_ADDRESS <= address < XML_ADDRESS + len(self._file.file.xml) + 4
-        if address < _BOOTSTRAP_bytes or is_in_xml:
+        if self.is_bootstrap(address, count) or is_in_xml:
             return super().read(address, count)
         return self._file.memory.read(address, count)
 
     def write(self, address: int, data: bytes) -> tuple[str, ...]:
         """Write; the names of our features that changed and of the commands that were given."""
-        if address in self._at and address < _BOOTSTRAP_bytes:
+        if address in self._at and address < BOOTSTRAP_bytes:
             return super().write(address, data)
         self._file.memory.write(address, data)
         given = {name: self._given_by(name, address, len(data)) for name in self._commands}

@@ -17,10 +17,12 @@ from foundation.errors import ConfigError
 LARGEST_bytes = 16 << 20  # ten times the largest of 27 makes and models
 _ZIP = b"PK\x03\x04"
 REGISTERS = frozenset({"IntReg", "MaskedIntReg", "FloatReg", "StructEntry"})
+_NUMBERS, _LONGEST_bytes = frozenset({"IntReg", "MaskedIntReg", "FloatReg", "StructReg"}), 8
 
 # What a node's value follows from: its own value, and the variables of a formula.
 _WRITTEN = frozenset({"pValue", "pValueIndexed", "pValueDefault"})
 _MADE_OF = _WRITTEN | {"pVariable"}
+_EVALUATED = _MADE_OF | {"pAddress", "pIndex", "pLength"}
 _NOT_A_NODE = frozenset({"EnumEntry", "pVariable", "Constant", "Expression"})
 
 
@@ -32,7 +34,7 @@ class GenicamFile:
         self.xml = text[max(begin, 0) :].rstrip()
         try:
             root = ET.fromstring(self.xml)
-        except (ET.ParseError, ValueError) as error:
+        except (ET.ParseError, ValueError, LookupError) as error:  # the last: an encoding that nobody knows
             raise ConfigError(f"{what} is no GenICam file: {error}") from error
         if _tag(root) != "RegisterDescription":
             raise ConfigError(f"{what} is no GenICam file: it begins with <{_tag(root)}>, not <RegisterDescription>")
@@ -43,6 +45,38 @@ class GenicamFile:
             name = element.get("Name")
             if name and _tag(element) not in _NOT_A_NODE:
                 self._nodes.setdefault(name, element)
+        if circular := self._circular():
+            raise ConfigError(f"{what} cannot be evaluated: the value of its {circular} is made of itself")
+        for name in filter(lambda each: self.kind(each) in _NUMBERS, self._nodes):
+            length = self.named(name, "Length")
+            if length and not 1 <= _integer(length) <= _LONGEST_bytes:
+                raise ConfigError(f"{what} cannot be evaluated: its {name} has the Length {length}, not 1 to 8 bytes")
+
+    def _circular(self) -> str:
+        """A node whose value is made of itself, over however many others, on which Aravis would crash; "" for none."""
+        ended: set[str] = set()
+        for start in self._nodes:
+            path, ahead = dict[str, None](), [(start, False)]
+            while ahead:
+                name, is_end = ahead.pop()
+                if is_end:
+                    del path[name]
+                    ended.add(name)
+                elif name in path:
+                    return name
+                elif name not in ended:
+                    path[name] = None
+                    ahead.append((name, True))
+                    ahead += [(each, False) for each in self._made_of(name, _EVALUATED)]
+        return ""
+
+    def _made_of(self, name: str, properties: frozenset[str]) -> Iterator[str]:
+        """The nodes that properties of a node name."""
+        for child in self._nodes[name]:
+            if _tag(child) in properties and "." not in child.get("Name", ""):  # a formula's "X.Max" is no value
+                target = (child.text or "").strip()
+                if target in self._nodes:
+                    yield target
 
     def __contains__(self, name: str) -> bool:
         return name in self._nodes and self.kind(name) != "Category"
@@ -76,10 +110,7 @@ class GenicamFile:
         """The node, and all that its value is made of, nearest first."""
         reached = [name]
         for each in reached:
-            for child in self._nodes[each]:
-                target = (child.text or "").strip()
-                if _tag(child) in properties and target in self._nodes and target not in reached:
-                    reached.append(target)
+            reached += [other for other in dict.fromkeys(self._made_of(each, properties)) if other not in reached]
         return reached
 
 
@@ -99,7 +130,7 @@ def _unzipped(data: bytes, path: Path) -> bytes:
     """The XML file in an archive, as many cameras hold theirs."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            files = [each for each in archive.infolist() if each.filename.lower().endswith(".xml")]
+            files = [each for each in archive.infolist() if _is_description(each.filename)]
             if len(files) != 1:
                 raise ConfigError(f"{path} is no GenICam file: an archive with {len(files)} XML files, not one")
             if files[0].file_size > LARGEST_bytes:
@@ -107,6 +138,19 @@ def _unzipped(data: bytes, path: Path) -> bytes:
             return archive.read(files[0])
     except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
         raise ConfigError(f"{path} is no GenICam file: an archive that cannot be read ({error})") from error
+
+
+def _is_description(name: str) -> bool:
+    """Whether a name in an archive is an XML file's; what macOS adds to each file begins with a dot."""
+    return name.lower().endswith(".xml") and not name.rpartition("/")[2].startswith(".")
+
+
+def _integer(text: str) -> int:
+    """A number of the file, 0 for none."""
+    try:
+        return int(text, 0)
+    except ValueError:
+        return 0
 
 
 def _tag(element: ET.Element) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 from drivers.framing.aravis_library import AravisError, library
 from drivers.sim.gige.genicam_file import GenicamFile
+from foundation.errors import ConfigError
 
 _PAGE_bytes = 4096
 _ADDRESS_MASK = 0xFFFFFFFF  # GVCP carries 32 bits of an address, also of a file for USB3 Vision
@@ -175,10 +176,15 @@ class Evaluated:
         self._library["arv_gc_enumeration_set_string_value"](self._node(name), entry.encode())
 
     def command_value(self, name: str) -> int:
-        """What a Command writes."""
-        if named := self.file.named(name, "pCommandValue"):
+        """What a Command writes; ConfigError when that is no number."""
+        named = self.file.named(name, "pCommandValue")
+        if named in self.file:
             return round(self.get(named))
-        return int(self.file.named(name, "CommandValue") or "0", 0)
+        text = named or self.file.named(name, "CommandValue") or "0"
+        try:
+            return int(text, 0)
+        except ValueError as error:
+            raise ConfigError(f"the GenICam file's {name} has the CommandValue {text!r}, no whole number") from error
 
     def place(self, register: str) -> tuple[int, int]:
         """Address and length of a register, bytes."""

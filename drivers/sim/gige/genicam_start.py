@@ -27,6 +27,8 @@ ENTRIES = {
     "DeviceTemperatureSelector": ("Sensor", "Mainboard"),
     "TemperatureSelector": ("Sensorboard", "Coreboard"),
 }
+_OF_A_CAMERA = ("Width", "Height", "PixelFormat", "PayloadSize")  # what lacks one of them is refused for that
+_USUAL = "Mono8"
 COMMANDS = ("AcquisitionStart", "AcquisitionStop", "TriggerSoftware")
 TEMPERATURES = ("DeviceTemperature", "TemperatureAbs", "CurrentTemperature")
 ROOM_degC = 40.0
@@ -49,6 +51,8 @@ WISHES: dict[str, Wish] = {
     **dict.fromkeys(TEMPERATURES, (ROOM_degC, None, None, 1)),
 }
 
+WRITTEN = ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw")
+
 _NEAR, _NEAR_ENOUGH = 1e-3, 0.03  # of a value; the second where a register has coarse steps
 _ALL_BITS = 2**32 - 1
 _LARGEST_RAW = float(2**31 - 1)  # of a register with a sign
@@ -68,7 +72,7 @@ def start_values(camera: Evaluated, width: int, height: int) -> tuple[str, ...]:
     spared = {register for name in WISHES if name in camera.file for register in camera.file.registers(name)}
     sides = {"Width": float(width), "Height": float(height)}
     for name, (value, lowest, highest, step) in WISHES.items():
-        if name not in camera.file or (name == "ExposureTimeRaw" and "ExposureTimeAbs" in camera.file):
+        if name not in camera.file or _is_beside(camera, name):
             continue
         axis = "Height" if "Height" in name or name.endswith("Y") else "Width"
         start = sides[axis] if value is None else value
@@ -77,12 +81,67 @@ def start_values(camera: Evaluated, width: int, height: int) -> tuple[str, ...]:
             reach(camera, bound, wanted, spared)
             spared.update(camera.file.registers(bound))
         reach(camera, name, start)
+        if name in WRITTEN:
+            _make_settable(camera, name, start)
         if value is None and (fixed := _got(camera, name) or 0.0) > 0:
             sides[axis] = min(sides[axis], fixed)
     _choose_entries(camera)
-    wished = [name for name, (value, *_) in WISHES.items() if value != 0 and name in camera.file]
-    mute = [name for name in COMMANDS if name in camera.file and not _make_effective(camera, name)]
-    return (*(name for name in wished if camera.file.registers(name) and not _got(camera, name)), *mute)
+    return tuple(_unplayed(camera))
+
+
+def _unplayed(camera: Evaluated) -> Iterator[str]:
+    """Features of which the registers do not make what a camera's would; none where the file is no camera's."""
+    file = camera.file
+    if any(name not in file for name in _OF_A_CAMERA):
+        return
+    for name, (value, *_) in WISHES.items():
+        if name not in file or _is_beside(camera, name):
+            continue
+        is_mute = value != 0 and file.registers(name) and not _got(camera, name)
+        if is_mute or (name in WRITTEN and not _make_settable(camera, name, value or 0.0)):
+            yield name
+    yield from (name for name in COMMANDS if name in file and not _make_effective(camera, name))
+    formats = file.entries("PixelFormat") if file.registers("PixelFormat") else {}
+    if _USUAL in formats and camera.entry("PixelFormat") != _USUAL:
+        yield "PixelFormat"
+    for name in WRITTEN:
+        conditions = [each for each in file.conditions(name) if each in file] if name in file else []
+        if any(file.registers(each) and not _got(camera, each) for each in conditions):
+            yield name
+
+
+def _is_beside(camera: Evaluated, name: str) -> bool:
+    """Whether a feature is the raw one of another, which is set instead."""
+    return name == "ExposureTimeRaw" and "ExposureTimeAbs" in camera.file
+
+
+def _make_settable(camera: Evaluated, name: str, value: float) -> bool:
+    """Have a feature become what is written to it, by the registers that its formula looks at; whether it does. One
+    that cannot be written does, too."""
+    written = camera.file.written(name)
+    if not written or _takes(camera, name, value):
+        return True
+    unset = [each for each in camera.file.registers(name) if each not in written and not _got(camera, each)]
+    for filler in _FILLERS if unset else ():
+        for register in unset:
+            _quietly(camera.set, register, filler)
+        if _takes(camera, name, value):
+            return True
+    for register in unset:
+        _quietly(camera.set, register, 0.0)
+    reach(camera, name, value)
+    return False
+
+
+def _takes(camera: Evaluated, name: str, value: float) -> bool:
+    """Whether twice the value and the value can be written, or none can."""
+    try:
+        camera.set(name, 2 * value)
+        is_taken = _nearest(camera, name, 2 * value)
+        camera.set(name, value)
+    except AravisError:
+        return True
+    return is_taken and _nearest(camera, name, value)
 
 
 def _make_effective(camera: Evaluated, command: str) -> bool:
