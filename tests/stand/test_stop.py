@@ -41,6 +41,15 @@ def post(port: int, path: str = "/api/v1/run/stop", **headers: str) -> tuple[int
         return answer.status, json.loads(answer.read())
 
 
+def pressed(port: int) -> dict[str, Any]:
+    """The answer to a STOP that is tried again as the page does it: among many who say nothing, one that a busy machine
+    keeps from speaking for 20 ms may be sent away with them."""
+    for _ in range(10):
+        with contextlib.suppress(OSError, http.client.HTTPException):
+            return post(port)[1]
+    return post(port)[1]
+
+
 def said(port: int, *parts: bytes) -> bytes:
     """All that comes back for these, each of them sent on its own, until the daemon hangs up."""
     with socket.create_connection(("127.0.0.1", port), LIMIT_S) as client:
@@ -84,7 +93,7 @@ async def test_a_stop_is_done_and_answered_whatever_others_do(tmp_path: Path, na
         await asyncio.to_thread(flood.__enter__)
         with contextlib.ExitStack() as stack:
             stack.push(flood)
-            assert (await asyncio.to_thread(post, port))[1]["verb"] == "stop"
+            assert (await asyncio.to_thread(pressed, port))["verb"] == "stop"
             assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
     assert "loopback" in [who.how for who, verb, _ in desk.orders if verb == "stop"]
 
