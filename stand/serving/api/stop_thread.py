@@ -31,7 +31,7 @@ Stopping = Callable[[Who], "concurrent.futures.Future[Done]"]
 
 _MOST_CLIENTS = 128  # of a door, before _AT_ONCE more are let in, who have not been answered or handed over
 _MOST_OTHERS = 64  # handed over, and not taken yet
-_AT_ONCE = 128
+_AT_ONCE = 128  # with the rest about 6,000 connections a second, more than most floods of one machine make
 _REST_S = 0.01  # at most, however much is asked of this thread
 _MAY_SPEAK_S = 0.02  # between connecting and speaking, on a busy machine: who is younger is not sent away
 _HEAD_BYTES = 1 << 15
@@ -62,6 +62,8 @@ class Others:
         """The one that has waited longest; BlockingIOError when there is none."""
         self.keep_spares()
         with self._lock:
+            if not self._waiting:
+                raise BlockingIOError
             os.eventfd_read(self._count)
             return self._waiting.popleft(), None
 
@@ -164,6 +166,8 @@ class StopThread:
         self._epoll = select.epoll()
         self._called = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._epoll.register(self._called, select.EPOLLIN)
+        self._lock = threading.Lock()
+        self._has_ended = False
         self._is_over = threading.Event()
         self._is_crowded = False
         self._thread = threading.Thread(target=self._run, name="stop", daemon=True)
@@ -187,8 +191,9 @@ class StopThread:
         self.others.close()
 
     def _call(self, _: object = None) -> None:
-        with suppress(OSError):  # it has ended
-            os.eventfd_write(self._called, 1)
+        with self._lock:
+            if not self._has_ended:  # else its number may be that of another file
+                os.eventfd_write(self._called, 1)
 
     def _run(self) -> None:
         pace = Pace()
@@ -208,7 +213,9 @@ class StopThread:
                 if door == "stop" or not self.has_failed:  # whoever accepts at the port now has STOP, too
                     listening.close()
             self._epoll.close()
-            os.close(self._called)
+            with self._lock:
+                self._has_ended = True
+                os.close(self._called)
 
     def _leave(self) -> None:
         for number in self._doors:
