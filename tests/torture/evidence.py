@@ -26,6 +26,7 @@ from tests.torture.lives import COMPLETE, KILLED, ROOT, Life
 
 ROW = np.dtype([("time_ns", "<i8"), *((name, "<f8") for name in TRUTH)])
 
+STEP_S = 0.5  # of the plant: what is switched or broken within a step acts from its begin on
 GIVEN_UP = "segment_given_up"
 """The event of a file that a disk has refused: it stays unfinished, and is salvaged when the run has ended."""
 
@@ -66,7 +67,7 @@ class Exchange:
 
 @dataclass
 class Evidence:
-    """frames: how often each (topic, instant) is there. metas: (instant, channel, step id) of the descriptions.
+    """frames: how often each (topic, instant) is there. metas: (instant, step id, flags) of the descriptions.
     temperatures: (instant, degC, quality) by the thermometer's name. Instants are ns."""
 
     case: Case
@@ -149,14 +150,14 @@ class Evidence:
     def excused(self, at_s: float, *names: str, after_s: float = 0.0) -> bool:
         """Whether a fault whose name begins so stood then, or not after_s before."""
         return any(
-            each.at_s <= at_s <= each.at_s + each.for_s + after_s
+            each.at_s - STEP_S <= at_s <= each.at_s + each.for_s + after_s
             for each in self.case.faults
             if each.name.startswith(names)
         )
 
     def ordered(self, at_s: float, verb: str, within_s: float) -> bool:
         """Whether somebody did that not within_s before."""
-        return any(each.verb == verb and 0 <= at_s - each.at_s <= within_s for each in self.case.orders)
+        return any(each.verb == verb and -STEP_S <= at_s - each.at_s <= within_s for each in self.case.orders)
 
     def killed_soon(self, at_s: float, within_s: float) -> bool:
         """Whether the program was killed not within_s after."""
@@ -198,7 +199,7 @@ class Evidence:
             parameters = json.loads(message.parameters_json or "{}")
             self.marks.append(Mark(time_ns, message.step_id, message.kind, message.state, parameters))
         elif topic.endswith("/meta"):
-            self.metas.append((time_ns, message.channel, message.step_id))
+            self.metas.append((time_ns, message.step_id, message.flags))
         elif topic == "/sensors/temperature":
             for described, value in message.ListFields():
                 if described.name.endswith("_degC"):

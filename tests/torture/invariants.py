@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tests import forked
-from tests.torture.evidence import Evidence
+from tests.torture.evidence import STEP_S, Evidence
 from tests.torture.lives import COMPLETE, KILLED, ROOT
 
 Rule = Callable[[Evidence], Iterable[str]]
@@ -22,9 +22,9 @@ INVARIANTS: dict[str, Rule] = {}
 MAX_AIR_DEGC, ABOVE_K = 65.0, 3.0
 # As the simulated stand has them: how long a permission lives, a reading is fresh, and the guard's looks are apart.
 HOLD_S, STALE_S, LOOK_S = 15.0, 15.0, 5.0
-STEP_S = 0.5  # of the plant: what is switched within a step acts from its begin on
 MIN_OFF_S = 300.0
 FLAP_SHUT_S = 60.0
+BAND_K = 1.0  # of a soak
 DURABLE_S = 15.0  # what is younger may be lost by a kill
 LONGEST_GAP_S, PROBED_S = 30.0, 60.0  # between readings; of how long a device is not asked that was lost
 MOST_AN_HOUR = 6
@@ -229,7 +229,7 @@ def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
             yield f"{run['frames_saved']} frames were saved at {at_s} s, of which {there} are there"
     skipped = {entry.get("step_id") for entry in evidence.journal if entry["entry"] == "Skipped"}
     lost = {said.data.get("step_id") for said in evidence.said if "lost" in said.kind or "dropped" in said.kind}
-    taken = Counter(step_id for _, _, step_id in evidence.metas)
+    taken = Counter(step_id for _, step_id, _ in evidence.metas)
     for mark in evidence.marks:
         if mark.kind == "Capture" and mark.state == "done" and mark.step_id not in skipped | lost:
             cameras = len(mark.parameters.get("cameras", ())) or len(evidence.stand["cameras"])
@@ -247,6 +247,21 @@ def journal_and_recording_agree(evidence: Evidence) -> Iterator[str]:
     for key in sorted(journal.keys() | recorded.keys()):
         if journal[key] != recorded[key]:
             yield f"step {key[0]} {key[1]}: {journal[key]} times in the journal, {recorded[key]} in the recording"
+
+
+@invariant
+def frames_are_at_their_temperature(evidence: Evidence) -> Iterator[str]:
+    """The air is within the soaks' band and what its sensor may be off, or the frame says `unsettled`; of captures that
+    a soak comes before."""
+    wanted = {mark.step_id: mark.parameters.get("chamber_degC") for mark in evidence.marks if mark.kind == "Capture"}
+    hurried = {entry.get("step_id") for entry in evidence.journal if entry["entry"] in ("Skipped", "Edited")}
+    for time_ns, step_id, flags in evidence.metas if not hurried else ():
+        at_s, degC, row = evidence.at_s(time_ns), wanted.get(step_id), evidence.true_at(time_ns)
+        is_odd = evidence.excused(at_s, "thermometer", "regulator", "chamber", after_s=600.0)
+        if degC is None or row is None or is_odd or "unsettled" in flags:
+            continue
+        if abs(float(row["bulk_air_degC"]) - degC) > BAND_K + _SENSOR_K:
+            yield f"a frame at {at_s} s for {degC:g} degC was taken at {row['bulk_air_degC']:.2f} degC"
 
 
 _SENSOR_K = 1.0  # the module's +-0.1 % of 200 K, a converter's noise, and how far the plant moves within a poll

@@ -103,6 +103,7 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "frames_saved_are_there_once": lambda evidence: evidence.frames.update(list(evidence.frames)[:1]),
     "journal_and_recording_agree": lambda evidence: evidence.marks.pop(),
     "readings_are_true": misread,
+    "frames_are_at_their_temperature": lambda evidence: changed(evidence, "bulk_air_degC", 40.0),
     "http_says_what_is_recorded": misread,
     "readings_go_on": lambda evidence: evidence.temperatures["air"].__delitem__(slice(50, 80)),
     "verify_finds_what_is_lost_and_nothing_else": lambda evidence: evidence.frames.popitem(),
