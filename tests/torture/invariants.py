@@ -243,6 +243,7 @@ def journal_and_recording_agree(evidence: Evidence) -> Iterator[str]:
     if not evidence.is_complete or evidence.killed:
         return
     journal = Counter((row["step_id"], row["state"]) for row in evidence.journal if row["entry"] == "Step")
+    journal.update((row["step_id"], "skipped") for row in evidence.journal if row["entry"] == "Skipped")
     recorded = Counter((mark.step_id, mark.state) for mark in evidence.marks if mark.state != "failed")
     for key in sorted(journal.keys() | recorded.keys()):
         if journal[key] != recorded[key]:
