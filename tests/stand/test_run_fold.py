@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments.steps import Soak
 from foundation.errors import ConfigError, SessionError
 from stand.running.executing.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
 from stand.running.memory.entries import (
@@ -168,3 +169,17 @@ def test_a_journal_of_the_version_before_changes_of_plans_is_read():
     assert [type(entry).__name__ for entry in entries] == kinds
     state = fold(PLAN, entries)
     assert (state.done, state.earned_s, state.ended.status) == ({"300c383f4748"}, {"a3f5ce16725c": 60.0}, "complete")
+
+
+@pytest.mark.parametrize(
+    ("entries", "is_unsettled"),
+    [
+        ([Dwell(0, ID[3], 100.0, "settled"), Step(0, ID[3], "done")], False),
+        ([Dwell(0, ID[3], 100.0, "unsettled"), Step(0, ID[3], "done")], True),
+        ([Skipped(0, ID[3])], True),
+    ],
+)
+def test_a_chamber_counts_as_unsettled_after_a_soak_that_ended_so_or_was_left_out(entries, is_unsettled):
+    guaranteed = tuple(dataclasses.replace(each, step=Soak(100.0)) if each.index == 3 else each for each in PLAN)
+    before = [Step(0, each, "done") for each in ID[:3]]
+    assert fold(guaranteed, [*before, *entries]).is_unsettled is is_unsettled

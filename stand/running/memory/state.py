@@ -158,9 +158,17 @@ class RunState:
 
     @property
     def is_unsettled(self) -> bool:
-        """Whether the last guaranteed soak at the present set-point ended without the chamber in its band."""
-        soaks = (soak.step_id for soak in reversed(self.set_up.soaks) if _is_guaranteed(soak))
-        return self.soaked.get(next(soaks, "")) == "unsettled"
+        """Whether the last guaranteed soak at the present set-point ended without the chamber in its band, or all of
+        them were left out."""
+        is_left_out = False
+        for planned in reversed(self.plan[: self.index]):
+            if planned.step_id in self.skipped:
+                is_left_out = is_left_out or _is_guaranteed(planned)
+            elif _is_guaranteed(planned):
+                return self.soaked.get(planned.step_id) == "unsettled"
+            elif isinstance(planned.step, StartChamber | SetTemperature | StopChamber):
+                break
+        return is_left_out
 
     def step(self, step_id: str) -> PlannedStep | None:
         """The step of that id in the plan in force."""
