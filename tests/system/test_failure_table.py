@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from drivers.wires import camera_connection
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.errors import ConfigError, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from foundation.hub import Hub
@@ -24,6 +25,7 @@ from stand.running.order import Order
 from stand.running.simulated_faults import break_or_mend, simulated_faults
 from stand.serving.desk import FaultRequest, Missing
 from stand.simulator import ControlSocket, Simulator, laboratory_of
+from tests.nightly import by_night
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.simulated_orders import simulated_order
 
@@ -93,11 +95,11 @@ ROWS = (
 # What ends a grab, and how: lost until the camera is opened again.
 CAMERA_LOST = (
     "camera.silent",
-    "camera.deaf",
+    by_night("camera.deaf"),
     "camera.stalled",
-    "camera.restart",
+    by_night("camera.restart"),
     "camera.control_lost",
-    "camera.power",
+    by_night("camera.power"),
 )
 
 
@@ -269,8 +271,11 @@ async def others_keep_their_rate(stand: Watched, row: Row, device: str) -> None:
 
 
 @pytest.mark.parametrize("name", CAMERA_LOST)
-async def test_a_camera_that_gives_no_frame_is_lost_and_returns_with_its_settings(laboratory: Order, name: str):
+async def test_a_camera_that_gives_no_frame_is_lost_and_returns_with_its_settings(
+    laboratory: Order, name: str, monkeypatch: pytest.MonkeyPatch
+):
     """The thermometers are read each period meanwhile. The exposure is no camera's own at power-on."""
+    monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 4.0)  # what each of three frames is waited for
     async with watched(laboratory, ("relays", "camera", "thermometers")) as stand:
         camera = stand.assembly.devices.cameras["camera"]
         await camera.grab()

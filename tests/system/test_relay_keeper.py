@@ -86,20 +86,22 @@ async def test_a_heater_relay_that_does_not_come_on_again_is_said_as_such(bench:
     await bench.end()
 
 
-async def test_heat_that_the_timer_of_a_silent_board_ends_is_known_as_ended_until_it_is_renewed(bench: Bench):
-    permits, begin_ns = bench.assembly.stand.chamber.permits, bench.clock.now_ns()
-    await bench.start(26, 60)
-    assert permits.ended_ns is None
-    await bench.fault("relays.silent", True)
-    await seconds_until(bench, "heater_enabled", 0, 20)
-    await bench.wait(1)
-    assert bench.trips == []
-    assert permits.ended_ns is not None
-    assert begin_ns + seconds_ns(60) < permits.ended_ns < bench.clock.now_ns()
-    await bench.fault("relays.silent", False)
-    await seconds_until(bench, "heater_enabled", 1, 20)
-    assert permits.ended_ns is None
-    await bench.end()
+async def test_heat_that_the_timer_of_a_silent_board_ends_is_known_as_ended_until_it_is_renewed(
+    order: Callable[..., Order], simulator: Start
+):
+    async with bench_of(order(bus={"timeout_s": 0.05}), simulator) as bench:
+        permits, begin_ns = bench.assembly.stand.chamber.permits, bench.clock.now_ns()
+        await bench.start(26, 60)
+        assert permits.ended_ns is None
+        await bench.fault("relays.silent", True)
+        await seconds_until(bench, "heater_enabled", 0, 20)
+        await bench.wait(1)
+        assert bench.trips == []
+        assert permits.ended_ns is not None
+        assert begin_ns + seconds_ns(60) < permits.ended_ns < bench.clock.now_ns()
+        await bench.fault("relays.silent", False)
+        await seconds_until(bench, "heater_enabled", 1, 20)
+        assert permits.ended_ns is None
 
 
 async def test_permits_that_are_renewed_in_time_are_never_taken_for_dropped(bench: Bench):
