@@ -291,7 +291,7 @@ def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
         readings = row["answer"].get("readings", {}) if isinstance(row["answer"], dict) else {}
         for channel, shown in readings.items():
             device, _, name = channel.partition(".")
-            if device != "thermometers" or shown["unit"] != "degC" or shown["quality"] != "good":
+            if device != "thermometers" or name not in evidence.temperatures or shown["quality"] != "good":
                 continue
             at_s, value = evidence.at_s(shown["time_ns"]), recorded.get((name, shown["time_ns"]))
             if (value is None or abs(value - shown["value"]) > 1e-6) and not evidence.killed_soon(at_s, DURABLE_S):

@@ -104,9 +104,14 @@ class Schedule:
     def __init__(self, case: Case, folder: Path, life: int) -> None:
         self.case, self._folder, self.disk = case, folder, Disk()
         self._doors = (folder / f"doors-{life}.jsonl").open("w")
+        before = folder / f"doors-{life - 1}.jsonl"
+        rows = before.read_text().splitlines() if before.exists() else []
+        self._done_ns = (
+            int(json.loads(rows[-1])["time_ns"]) if rows else 0
+        )  # a life may begin before the last one's end
 
     async def run(self, clock: VirtualClock) -> None:
-        begin_s = (clock.now_ns() - self.case.start_ns) / NS_PER_S
+        begin_s = (max(clock.now_ns(), self._done_ns) - self.case.start_ns) / NS_PER_S
         kills = [Order("kill", at_s) for at_s in self.case.kills_s]
         looks = [Order("state", begin_s + LOOK_EVERY_S * (number + 1)) for number in range(LOOKS)]
         for order in sorted((*self.case.orders, *kills, *looks), key=lambda order: order.at_s):
