@@ -139,7 +139,8 @@ def clear(
         text = f"cleared; held again: {again.rule}: {again.text}"
         _say(server, {**answer, "text": text, "reasons": [INTERLOCK]}, f"{text}; {for_reason(INTERLOCK)}")
     else:
-        _say(server, answer, f"{text}; {_still(answer)}" if answer.get("reasons") else text)
+        held = _still(answer) if answer.get("reasons") else "nothing holds the stand any more"
+        _say(server, answer, f"{text}; {held}")
 
 
 @app.command()
@@ -148,7 +149,8 @@ def skip(
     server: Server,
     step: StepArgument,
 ) -> None:
-    """Leave a step out; a soak, capture, cool-down or prompt under way is broken off.
+    """Leave a step out; a soak, capture, cool-down or prompt under way is broken off. Frames after a soak that was left
+    out are flagged `unsettled`, and a fit leaves them out.
 
     Example: stand skip 12
     """

@@ -137,7 +137,7 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         assert desk.gate.reasons == {"operator", "interlock"}
         held = (await invoke("continue", tmp_path)).stdout
         assert "still held: interlock; `stand clear` once the cause is removed" in held
-        assert (await invoke("clear", tmp_path)).stdout.strip() == f"{path}: cleared"
+        assert (await invoke("clear", tmp_path)).stdout.strip() == f"{path}: cleared; nothing holds the stand any more"
         nothing = await invoke("clear", tmp_path)
         assert nothing.exit_code == 1
         assert "nothing to clear" in nothing.stderr

@@ -1,5 +1,5 @@
 /* The heater's dead-man: permission, relay timer, guard, a second master on the bus, and a program that is stopped,
-   killed or started again at any instant. One step of Second() is one second; what happens within it comes in any order.
+   killed or started again at any instant. One call of second() is one second; what happens within it comes in any order.
 
    Times in s, given by -D from the program's own settings (test_dead_man_model.py):
    HOLD    a timed-on of the relay          RENEW   between two of them
@@ -8,7 +8,7 @@
    BUS     a command may be on its way
 
    Left out: the regulator's own limits, the thermal cut-out, and what a second master does to the regulator. Assumed: a
-   timed-on replaces a steady one (facts/relays). */
+   timed-on replaces a steady one, and begins anew when it comes again (the test of the timer at each start). */
 
 /* Heat after the last look of a guard. Once HOLD would do, but for a program that is stopped between asking the guard and
    sending, and goes on for an instant later. */

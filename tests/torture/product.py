@@ -106,9 +106,8 @@ class Schedule:
         self._doors = (folder / f"doors-{life}.jsonl").open("w")
         before = folder / f"doors-{life - 1}.jsonl"
         rows = before.read_text().splitlines() if before.exists() else []
-        self._done_ns = (
-            int(json.loads(rows[-1])["time_ns"]) if rows else 0
-        )  # a life may begin before the last one's end
+        # A life may begin before the last one's end: its orders are not given twice.
+        self._done_ns = int(json.loads(rows[-1])["time_ns"]) if rows else 0
 
     async def run(self, clock: VirtualClock) -> None:
         begin_s = (max(clock.now_ns(), self._done_ns) - self.case.start_ns) / NS_PER_S

@@ -101,7 +101,7 @@ class OpenStand:
     def cleared(self) -> str:
         """What an operator is told who has cleared the stand."""
         still = "" if self._guard is None else self._guard.still_wrong()
-        return f"cleared; {still}" if still else "cleared; nothing is wrong any more"
+        return f"cleared; {still}" if still else "cleared"
 
     def is_well(self) -> bool:
         """Whether the guard looks as often as it must, and finds nothing."""
