@@ -177,11 +177,11 @@ class Laboratory:
             camera.advance(now_ns)
 
     def state(self) -> dict[str, float]:
-        """The plant's true state now; `now_ns` is the laboratory's time."""
+        """The plant's true state now; `now_ns` is the laboratory's time. The flap is faster than the plant's grid."""
         with self.plant.lock:
             now_ns = self._clock.now_ns()
             self.plant.advance(now_ns)
-            return {"now_ns": now_ns, **self.plant.state()}
+            return {"now_ns": now_ns, **self.plant.state(), "flap_open": self.plant.flap_open_at(now_ns)}
 
     def true_centres_px(self) -> list[list[float]]:
         """Noise-free marker centres (x, y) as the camera named so, or the first, sees them; marker 1 first."""
