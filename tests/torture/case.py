@@ -42,7 +42,8 @@ class Order:
 class Case:
     """stand: the choice at each place of tests.system.test_stand_combinations.PLACES. plan: a recipe's steps or
     experiments. kills_s: when the program is killed; each time its run is resumed. drawn_order: sleepers with one
-    deadline, and tasks ready at one wake, run in an order drawn from the seed."""
+    deadline, and tasks ready at one wake, run in an order drawn from the seed. is_real: in real time, see real.py.
+    start_ns: the instant from which its seconds count."""
 
     seed: int
     stand: dict[str, str]
@@ -54,11 +55,8 @@ class Case:
     faults: tuple[Fault, ...] = ()
     orders: tuple[Order, ...] = ()
     kills_s: tuple[float, ...] = ()
-
-    @property
-    def start_ns(self) -> int:
-        """The instant from which its seconds count."""
-        return START_NS
+    is_real: bool = False
+    start_ns: int = START_NS
 
 
 PLAIN = {

@@ -143,6 +143,30 @@ class Evidence:
         return bool(self.lives) and self.lives[-1].status == COMPLETE
 
     @property
+    def hold_s(self) -> float:
+        """How long a permission of heat lives."""
+        return self.stand["guard"].get("heater_hold_s", 15.0)
+
+    @property
+    def stale_s(self) -> float:
+        """How long a reading is fresh."""
+        return self.stand["guard"]["stale_after_s"]
+
+    @property
+    def look_s(self) -> float:
+        """How far apart the guard's looks are."""
+        return self.stand["guard"]["period_s"]
+
+    @property
+    def min_off_s(self) -> float:
+        """How long the compressor rests."""
+        return self.stand.get("compressor", {}).get("min_off_s", 300.0)
+
+    def off_from_ns(self, life: int) -> int:
+        """From when on, after that life's end, everything is off: the laboratory goes on for AFTER_S."""
+        return int(self.truth[life]["time_ns"][-1] - 60e9)
+
+    @property
     def killed(self) -> int:
         """How many lives were."""
         return sum(life.status == KILLED for life in self.lives)

@@ -1,5 +1,5 @@
 """What must be so whatever breaks. An invariant is a function of the evidence that yields a sentence for each
-violation; `@invariant` enters it."""
+violation; `@invariant` enters it, and says of which leg it is: virtual time, real time, or both."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from enum import Flag, auto
 
 import numpy as np
 
@@ -19,10 +20,8 @@ from tests.torture.lives import COMPLETE, KILLED, ROOT
 
 Rule = Callable[[Evidence], Iterable[str]]
 INVARIANTS: dict[str, Rule] = {}
+LEGS: dict[str, Leg] = {}
 MAX_AIR_DEGC, ABOVE_K = 65.0, 3.0
-# As the simulated stand has them: how long a permission lives, a reading is fresh, and the guard's looks are apart.
-HOLD_S, STALE_S, LOOK_S = 15.0, 15.0, 5.0
-MIN_OFF_S = 300.0
 FLAP_SHUT_S = 60.0
 BAND_K = 1.0  # of a soak
 DURABLE_S = 15.0  # what is younger may be lost by a kill
@@ -41,24 +40,36 @@ class Violation:
     count: int
 
 
-def invariant(rule: Rule) -> Rule:
+class Leg(Flag):
+    """In which time it must be so."""
+
+    VIRTUAL, REAL = auto(), auto()
+    BOTH = VIRTUAL | REAL
+
+
+def invariant(of: Leg) -> Callable[[Rule], Rule]:
     """Enter it under its name."""
-    INVARIANTS[rule.__name__] = rule
-    return rule
+
+    def enter(rule: Rule) -> Rule:
+        INVARIANTS[rule.__name__], LEGS[rule.__name__] = rule, of
+        return rule
+
+    return enter
 
 
 def violations(evidence: Evidence) -> list[Violation]:
     """All that is not as it must be; of a program that hung and was killed for it only that."""
     hung = any(life.status is None for life in evidence.lives)
     rules = {"ends_as_documented": ends_as_documented} if hung else INVARIANTS
-    judged = ((name, list(rule(evidence))) for name, rule in rules.items())
+    leg = Leg.REAL if evidence.case.is_real else Leg.VIRTUAL
+    judged = ((name, list(rule(evidence))) for name, rule in rules.items() if LEGS[name] & leg)
     return [Violation(name, sentences[0], len(sentences)) for name, sentences in judged if sentences]
 
 
 # The plant
 
 
-@invariant
+@invariant(Leg.BOTH)
 def air_is_never_too_warm(evidence: Evidence) -> Iterator[str]:
     for truth in evidence.truth:
         for row in truth[truth["bulk_air_degC"] > MAX_AIR_DEGC + ABOVE_K][:1]:
@@ -81,19 +92,19 @@ def _armed(evidence: Evidence, life: int) -> Iterator[int]:
             yield each.time_ns
 
 
-@invariant
+@invariant(Leg.BOTH)
 def heat_needs_a_permission_of_the_last_15_s(evidence: Evidence) -> Iterator[str]:
     """The relay's timer, armed by a guard that looks; what a second master switches on is off within 5 s."""
     for life, truth in enumerate(evidence.truth if "relays" in evidence.stand else ()):
         on_ns = truth["time_ns"][truth["heater_enabled"] > 0]
-        late = _since_s(on_ns + int(STEP_S * 1e9), _armed(evidence, life)) > HOLD_S + 2 * STEP_S
+        late = _since_s(on_ns + int(STEP_S * 1e9), _armed(evidence, life)) > evidence.hold_s + 2 * STEP_S
         for at_s in map(evidence.at_s, map(int, on_ns[late])):
-            is_odd = evidence.excused(at_s, "bus", "relays", after_s=HOLD_S + 2 * LOOK_S)
-            if not is_odd and not evidence.ordered(at_s, "switch_on", HOLD_S + 2 * LOOK_S):
-                yield f"the heater's relay is on at {at_s} s, {HOLD_S:g} s after it was last armed"
+            is_odd = evidence.excused(at_s, "bus", "relays", after_s=evidence.hold_s + 2 * evidence.look_s)
+            if not is_odd and not evidence.ordered(at_s, "switch_on", evidence.hold_s + 2 * evidence.look_s):
+                yield f"the heater's relay is on at {at_s} s, {evidence.hold_s:g} s after it was last armed"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def heat_needs_fresh_readings(evidence: Evidence) -> Iterator[str]:
     """The relay is armed only while the module with the air's thermometer answers. Before the first reading the board's
     timer is tested, with the regulator stopped."""
@@ -101,12 +112,12 @@ def heat_needs_fresh_readings(evidence: Evidence) -> Iterator[str]:
     for life, bus in enumerate(evidence.bus if "relays" in evidence.stand else ()):
         read = [each.time_ns for each in bus if each.unit == unit and each.function in (3, 4) and each.is_answered]
         armed = np.array(list(_armed(evidence, life)), dtype=np.int64)
-        late = (_since_s(armed, read) > STALE_S + LOOK_S) & (armed > read[0] if read else False)
+        late = (_since_s(armed, read) > evidence.stale_s + evidence.look_s) & (armed > read[0] if read else False)
         for time_ns in armed[late]:
             yield f"heat was permitted at {evidence.at_s(int(time_ns))} s without a reading of the air"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def nothing_heats_unrecorded(evidence: Evidence) -> Iterator[str]:
     """No heat before the run's begin is recorded."""
     begun = [said.time_ns for said in evidence.said if said.kind in ("run.start", "run.resume")]
@@ -115,25 +126,24 @@ def nothing_heats_unrecorded(evidence: Evidence) -> Iterator[str]:
         for row in truth[heats][:1]:
             at_s = evidence.at_s(int(row["time_ns"]))
             is_odd = evidence.excused(at_s, "heater", "relays.welded", "heat_module", "regulator", after_s=30.0)
-            is_odd = is_odd or evidence.ordered(at_s, "switch_on", HOLD_S)
+            is_odd = is_odd or evidence.ordered(at_s, "switch_on", evidence.hold_s)
             if not is_odd and (not begun or int(row["time_ns"]) + STEP_S * 1e9 < min(begun)):
                 yield f"heat at {at_s} s, before anything was recorded"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def compressor_rests(evidence: Evidence) -> Iterator[str]:
     """Also from life to life. What somebody else switches is none of ours."""
-    off_ns = None
+    off_s = None
     has_one = "compressor" in evidence.stand.get("relays", {}).get("channels", {})
     for truth in evidence.truth if has_one else ():
         on = truth["compressor_on"] > 0
         for place in np.flatnonzero(on[1:] != on[:-1]) + 1:
-            time_ns = int(truth["time_ns"][place])
-            at_s = evidence.at_s(time_ns)
+            at_s = evidence.at_s(int(truth["time_ns"][place]))
             is_odd = evidence.excused(at_s, "relays", "bus", after_s=30.0) or evidence.ordered(at_s, "switch_on", 30.0)
-            if on[place] and off_ns is not None and not is_odd and (time_ns - off_ns) / 1e9 < MIN_OFF_S - 2 * STEP_S:
-                yield f"the compressor starts at {at_s} s, {(time_ns - off_ns) / 1e9:.0f} s after it stopped"
-            off_ns = off_ns if on[place] else time_ns
+            if on[place] and off_s is not None and not is_odd and at_s - off_s < evidence.min_off_s - 2 * STEP_S:
+                yield f"the compressor starts at {at_s} s, {at_s - off_s:.0f} s after it stopped"
+            off_s = off_s if on[place] else at_s
 
 
 # The flap, and the safe state
@@ -151,7 +161,7 @@ def _holds(evidence: Evidence) -> Iterator[tuple[int, int]]:
             begun_ns = None
 
 
-@invariant
+@invariant(Leg.BOTH)
 def flap_is_open_for_captures_only(evidence: Evidence) -> Iterator[str]:
     """From the begin of a step that opens it (a look in a soak, too) to the end of the one that closes it."""
     opens = sorted(
@@ -168,28 +178,29 @@ def flap_is_open_for_captures_only(evidence: Evidence) -> Iterator[str]:
                 yield f"the flap is open at {at_s} s, outside captures"
 
 
-_SAFE = {"heater_enabled": HOLD_S + LOOK_S, "compressor_on": HOLD_S + LOOK_S, "flap_open": FLAP_SHUT_S}
-"""What is off, or shut, in the safe state, and within how many s."""
+def _safe(evidence: Evidence) -> dict[str, float]:
+    """What is off, or shut, in the safe state, and within how many s."""
+    off_s = evidence.hold_s + evidence.look_s
+    return {"heater_enabled": off_s, "compressor_on": off_s, "flap_open": FLAP_SHUT_S}
 
 
-@invariant
+@invariant(Leg.BOTH)
 def holds_are_safe(evidence: Evidence) -> Iterator[str]:
     for begin_ns, end_ns in _holds(evidence):
         for truth in evidence.truth:
             if len(truth) and truth["time_ns"][0] <= begin_ns <= truth["time_ns"][-1]:
-                for name, within_s in _SAFE.items():
+                for name, within_s in _safe(evidence).items():
                     yield from _acting(evidence, truth, name, begin_ns + int(within_s * 1e9), end_ns, "a hold")
 
 
-@invariant
+@invariant(Leg.BOTH)
 def ends_are_safe(evidence: Evidence) -> Iterator[str]:
     """30 s after the program is gone, however it went, and from then on; a flap that nobody can shut apart."""
-    for truth, life in zip(evidence.truth, evidence.lives, strict=True):
-        for name in _SAFE if len(truth) else ():
+    for number, (truth, life) in enumerate(zip(evidence.truth, evidence.lives, strict=True)):
+        for name in _safe(evidence) if len(truth) else ():
             if name != "flap_open" or life.status != KILLED:
-                end_ns = int(truth["time_ns"][-1])
-                when = f"the end with status {life.status}"
-                yield from _acting(evidence, truth, name, end_ns - int(60e9), end_ns, when)
+                begin_ns, end_ns = evidence.off_from_ns(number), int(truth["time_ns"][-1])
+                yield from _acting(evidence, truth, name, begin_ns, end_ns, f"the end with status {life.status}")
 
 
 def _acting(evidence: Evidence, truth: np.ndarray, name: str, begin_ns: int, end_ns: int, when: str) -> Iterator[str]:
@@ -210,12 +221,12 @@ def _acting(evidence: Evidence, truth: np.ndarray, name: str, begin_ns: int, end
 # Records
 
 
-@invariant
+@invariant(Leg.BOTH)
 def files_are_readable(evidence: Evidence) -> Iterator[str]:
     yield from evidence.unreadable if evidence.is_complete else ()
 
 
-@invariant
+@invariant(Leg.BOTH)
 def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
     """What HTTP said was saved, and what captures that are done have to have."""
     for (topic, time_ns), count in evidence.frames.items():
@@ -237,7 +248,7 @@ def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
                 yield f"the capture {mark.step_id} is done with {taken[mark.step_id]} of {wanted} frames"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def journal_and_recording_agree(evidence: Evidence) -> Iterator[str]:
     """The steps that are done, of a run that is complete and was not killed: each once in both."""
     if not evidence.is_complete or evidence.killed:
@@ -250,7 +261,7 @@ def journal_and_recording_agree(evidence: Evidence) -> Iterator[str]:
             yield f"step {key[0]} {key[1]}: {journal[key]} times in the journal, {recorded[key]} in the recording"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def frames_are_at_their_temperature(evidence: Evidence) -> Iterator[str]:
     """The air is within the soaks' band and what its sensor may be off, or the frame says `unsettled`. Each capture
     of a case has a soak before it, which somebody may have left out."""
@@ -268,7 +279,7 @@ _SENSOR_K = 1.0  # the module's +-0.1 % of 200 K, a converter's noise, and how f
 _TRUE = {name: f"{name}_degC" for name in ("air", "granite_inside", "granite_outside", "artifact", "laboratory")}
 
 
-@invariant
+@invariant(Leg.BOTH)
 def readings_are_true(evidence: Evidence) -> Iterator[str]:
     """A GOOD reading is what the plant was, within what its sensor may be off; of sensors that were not broken."""
     for name, rows in evidence.temperatures.items():
@@ -281,7 +292,7 @@ def readings_are_true(evidence: Evidence) -> Iterator[str]:
                 yield f"{name} was read as {value:.2f} degC at {at_s} s, and is {true:.2f} degC"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
     """A temperature that HTTP showed is in the recording, but for the last ones before a kill."""
     if not evidence.is_complete or any("lost" in said.kind or "dropped" in said.kind for said in evidence.said):
@@ -298,7 +309,7 @@ def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
                 yield f"HTTP showed {channel} {shown['value']:.3f} of {at_s} s, the recording has {value}"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def readings_go_on(evidence: Evidence) -> Iterator[str]:
     """The air is recorded from the first reading of a life to its last, also where it cannot be read."""
     times_ns = np.array([row[0] for row in evidence.temperatures.get("air", ())], dtype=np.int64)
@@ -311,7 +322,7 @@ def readings_go_on(evidence: Evidence) -> Iterator[str]:
                 yield f"no reading of the air for {(own[place + 1] - own[place]) / 1e9:.0f} s from {at_s} s on"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def verify_finds_what_is_lost_and_nothing_else(evidence: Evidence) -> Iterator[str]:
     """Of a run that is complete nothing is damaged, and what is missing has an event that says so."""
     if not evidence.is_complete:
@@ -333,7 +344,7 @@ def verify_finds_what_is_lost_and_nothing_else(evidence: Evidence) -> Iterator[s
 # How it ends
 
 
-@invariant
+@invariant(Leg.BOTH)
 def ends_as_documented(evidence: Evidence) -> Iterator[str]:
     for number, life in enumerate(evidence.lives):
         if life.status is None:
@@ -346,7 +357,7 @@ def ends_as_documented(evidence: Evidence) -> Iterator[str]:
             yield f"life {number} ended with status {life.status} and said nothing"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def is_completed_in_the_end(evidence: Evidence) -> Iterator[str]:
     """Faults end; a run that is resumed after them comes to its end."""
     last = evidence.lives[-1]
@@ -354,7 +365,7 @@ def is_completed_in_the_end(evidence: Evidence) -> Iterator[str]:
         yield f"not complete after {len(evidence.lives)} lives: {last.err.strip()[-400:]}"
 
 
-@invariant
+@invariant(Leg.BOTH)
 def nobody_is_pestered(evidence: Evidence) -> Iterator[str]:
     """No warning or error more than six times an hour."""
     times: dict[tuple[str, str], list[int]] = {}

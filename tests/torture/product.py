@@ -11,30 +11,26 @@ from __future__ import annotations
 import asyncio
 import errno
 import faulthandler
-import http.client
 import json
 import os
 import random
-import re
 import signal
-import socket
-import struct
 import sys
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import stand.running.run as run_module
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
-from foundation.errors import StandError
 from recording.writing import notices
+from stand.serving.client import Server, server_of
 from stand.simulator import Simulator
 from tests.torture.case import Case, Order, read_case
+from tests.torture.doors import Doors
 from tests.torture.laboratory import FOLDER, LIFE
 from tests.torture.lives import HIDDEN, find_folder
 
 LOOK_EVERY_S, LOOKS = 300.0, 200  # at what HTTP says
-_DOOR_S = 20.0  # of the host
 _TASKS = ("TaskStepMethWrapper", "TaskWakeupMethWrapper", "builtin_function_or_method")
 _SIGNALS = {"stop": signal.SIGTERM, "interrupt": signal.SIGINT}
 
@@ -103,7 +99,8 @@ class Schedule:
 
     def __init__(self, case: Case, folder: Path, life: int) -> None:
         self.case, self._folder, self.disk = case, folder, Disk()
-        self._doors = (folder / f"doors-{life}.jsonl").open("w")
+        bus = partial(os.environ.get, "TORTURE_BUS", "")
+        self.doors = Doors(case, folder / f"doors-{life}.jsonl", self._server, bus, self._name)
         before = folder / f"doors-{life - 1}.jsonl"
         rows = before.read_text().splitlines() if before.exists() else []
         # A life may begin before the last one's end: its orders are not given twice.
@@ -120,37 +117,28 @@ class Schedule:
                     await asyncio.to_thread(self._do, order, clock.now_ns())
 
     def _do(self, order: Order, now_ns: int) -> None:
-        session = next(iter(sorted((self._folder / "out").glob("*/journal.jsonl"))), None)
-        session = session and session.parent
         match order.verb:
             case "kill":
-                self._note(order, now_ns, self._asked(session, "GET", "state"))
+                self.doors.note(order, now_ns, self.doors.asked("GET", "state"))
                 os.kill(os.getpid(), signal.SIGKILL)
             case "stop" | "interrupt":
-                self._note(order, now_ns, None)
+                self.doors.note(order, now_ns, None)
                 os.kill(os.getpid(), _SIGNALS[order.verb])
             case "lose_folder" | "find_folder" | "fill_disk" | "empty_disk" | "refuse_writes" | "take_writes":
-                self._note(order, now_ns, self._change_disk(order.verb, session))
-            case "switch_on" | "switch_off":
-                self._note(order, now_ns, self._second_master(order))
-            case "state":
-                state = self._asked(session, "GET", "state")
-                self._note(order, now_ns, state)
-                if self.case.attended and isinstance(state, dict) and state.get("prompt"):
-                    self._asked(session, "POST", "run/continue", {})
-            case "skip" | "extend":
-                plan = self._asked(session, "GET", "plan")
-                steps = plan if isinstance(plan, list) else []
-                under_way = next((each["step_id"] for each in steps if each.get("standing") == "under_way"), "none")
-                by: dict[str, object] = {"by_s": 60.0} if order.verb == "extend" else {}
-                body = {**by, "step_id": under_way}
-                self._note(order, now_ns, self._asked(session, "POST", f"run/{order.verb}", body))
-            case "note":
-                name = session.name if session else "none"
-                body = {"text": "a note", "tags": ["torture"]}
-                self._note(order, now_ns, self._asked(session, "POST", f"sessions/{name}/notes", body))
+                self.doors.note(order, now_ns, self._change_disk(order.verb, self._session()))
             case _:
-                self._note(order, now_ns, self._asked(session, "POST", f"run/{order.verb}", {}))
+                self.doors.give(order, now_ns)
+
+    def _session(self) -> Path | None:
+        found = next(iter(sorted((self._folder / "out").glob("*/journal.jsonl"))), None)
+        return found and found.parent
+
+    def _name(self) -> str:
+        session = self._session()
+        return session.name if session else ""
+
+    def _server(self) -> Server:
+        return server_of(self._session() or self._folder)
 
     def _change_disk(self, verb: str, session: Path | None) -> bool:
         """Whether it could be done."""
@@ -163,35 +151,6 @@ class Schedule:
         else:
             self.disk.refuses = verb == "refuse_writes"
         return True
-
-    def _note(self, order: Order, now_ns: int, answer: object) -> None:
-        row = {"time_ns": now_ns, "verb": order.verb, "body": order.body, "answer": answer}
-        self._doors.write(f"{json.dumps(row)}\n")
-        self._doors.flush()
-
-    def _asked(self, session: Path | None, method: str, path: str, body: dict[str, object] | None = None) -> object:
-        """The answer, or the sentence of a refusal; None where there is nobody to ask."""
-        from stand.serving.client import server_of
-
-        if session is None:
-            return None
-        try:
-            return server_of(session).request(method, f"/api/v1/{path}", body, _DOOR_S)
-        except (StandError, OSError, http.client.HTTPException) as error:
-            return {"refused": str(error)}
-
-    def _second_master(self, order: Order) -> object:
-        """Another program on the bus writes a coil of the relay board, for good."""
-        found = re.fullmatch(r"tcp:(.+):(\d+)", os.environ.get("TORTURE_BUS", ""))
-        if found is None:
-            return None
-        value = 0xFF00 if order.verb == "switch_on" else 0
-        frame = struct.pack(">HHHBBHH", 7, 0, 6, 2, 5, int(order.body.get("relay", 0)), value)
-        with suppress(OSError), socket.create_connection((found[1], int(found[2])), 1.0) as wire:
-            wire.settimeout(1.0)
-            wire.sendall(frame)
-            return wire.recv(64).hex()
-        return None
 
 
 def _say_where() -> None:
