@@ -71,6 +71,7 @@ def whole_file(path: Path) -> Generator[TextIO]:
             file.flush()
             _check_place(path)
             _placed(file.fileno(), temporary, path)
+        sync_folder(path.parent)
     except OSError as error:
         raise _refused(path, error) from error
     finally:

@@ -20,12 +20,14 @@ import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from foundation.clock import Boot, seconds_ns
-from foundation.files import sync_folder
+from foundation.files import make_durable_folder, sync_folder
+from foundation.sealed import seal, unseal
 from stand.config.stand_config import CompressorConfig
 
+_KIND = "compressor"
 # Calls of `keep`, and of which of them the file at a path is.
 _calls = itertools.count(1)
 _placed: dict[Path, int] = {}
@@ -84,8 +86,8 @@ def restored(path: Path | None, now_ns: int, boot: Boot | None) -> CompressorSta
     if path is None:
         return unknown
     try:
-        kept = _Kept.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError):
+        kept = _Kept.model_validate_json(unseal(_KIND, path.read_bytes()))
+    except (OSError, ValueError):
         return unknown
     if not kept.counts_in(boot):
         return unknown
@@ -103,7 +105,7 @@ def keep(path: Path | None, state: CompressorState, boot: Boot | None) -> None:
     if path is None:
         return
     number = next(_calls)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_durable_folder(path.parent)
     part = path.with_name(f".{path.name}.{os.getpid()}-{number}.part")
     try:
         _write(part, state, boot)
@@ -120,7 +122,7 @@ def _write(path: Path, state: CompressorState, boot: Boot | None) -> None:
     began_ns = 0 if boot is None else boot.began_ns
     starts_ns = [start_ns - began_ns for start_ns in state.starts_ns]
     kept = {"running": state.running, "since_ns": state.since_ns - began_ns, "starts_ns": starts_ns}
-    with path.open("w", encoding="utf-8") as file:
-        json.dump(kept if boot is None else {**kept, "boot_id": boot.id}, file)
+    with path.open("wb") as file:
+        file.write(seal(_KIND, json.dumps(kept if boot is None else {**kept, "boot_id": boot.id})))
         file.flush()
         os.fsync(file.fileno())

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from foundation.documents import Document
 from foundation.errors import ConfigError
+from foundation.files import make_durable_folder, sync_folder
 from stand.config.private_file import private_document
 
 TokenName = Annotated[str, Field(pattern=r"^[\w.@-]{1,64}$")]
@@ -77,7 +78,7 @@ def write_tokens(path: Path, tokens: TokenFile) -> None:
         lines += [f"{key}:\n" if of else f"{key}: {{}}\n"]
         lines += [f"  {json.dumps(name)}: {json.dumps(token)}\n" for name, token in sorted(of.items())]
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(path.parent)
         part.unlink(missing_ok=True)
         fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with open(fd, "w", encoding="utf-8") as file:
@@ -85,5 +86,6 @@ def write_tokens(path: Path, tokens: TokenFile) -> None:
             file.flush()
             os.fsync(fd)
         part.replace(path)
+        sync_folder(path.parent)  # else a token that was taken away may be back after a power cut
     except OSError as error:
         raise ConfigError(f"interface.secrets: {path}: cannot be written ({error.strerror})") from error

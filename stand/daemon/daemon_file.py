@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from foundation.calls import Lane
 from foundation.clock import Clock
@@ -18,8 +18,10 @@ from foundation.files import replace_file
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.patience import Patience
+from foundation.sealed import seal, unseal
 
 NAME = "daemon.json"
+_KIND = "counters"
 _CLOSE_LIMIT_S = 1.0
 
 
@@ -36,10 +38,10 @@ def kept_in(directory: Path) -> tuple[Kept, str]:
     the counters begin again. Blocking."""
     path = directory / NAME
     try:
-        return Kept.model_validate_json(path.read_bytes()), ""
+        return Kept.model_validate_json(unseal(_KIND, path.read_bytes())), ""
     except FileNotFoundError:
         return Kept(), ""
-    except (OSError, ValidationError) as error:
+    except (OSError, ValueError) as error:
         aside = path.with_name(f"{NAME}.damaged")
         with suppress(OSError):
             path.replace(aside)
@@ -79,7 +81,8 @@ class KeptFile:
         while self._waiting is not None:
             kept, self._waiting = self._waiting, None
             try:
-                await self._lane.call(self._run, replace_file, self._path, kept.model_dump_json(indent=1).encode())
+                data = seal(_KIND, kept.model_dump_json(indent=1))
+                await self._lane.call(self._run, replace_file, self._path, data)
             except (OSError, TimeoutError) as error:
                 text = f"counters are not kept for the next start: {error}"
                 self._hub.publish(Event(self._clock.now_ns(), "warning", "daemon_not_kept", text))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from foundation.clock import WallClock
 from foundation.errors import StandTripped
+from foundation.files import make_folder
 from foundation.hub import Hub
 from foundation.items import Event
 from recording.repair.salvage import salvage_line, salvage_unfinished
@@ -52,7 +53,7 @@ async def serve(
     """
     async with Stop() as stop, claimed(config, None):
         hub, clock = stand_hub(), WallClock()
-        await asyncio.to_thread(out.mkdir, parents=True, exist_ok=True)
+        await asyncio.to_thread(make_folder, out)
         kept, damage = await asyncio.to_thread(kept_in, out)
         latched = await asyncio.to_thread(StandLatch.of(config).read)
         watch = ClockWatch(hub, clock)

@@ -18,12 +18,14 @@ from foundation.documents import Document, yaml_data
 from foundation.errors import SessionError
 from foundation.files import replace_file
 from foundation.items import StepMark, StepState
+from foundation.sealed import seal, unseal
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig
 from stand.estimating.chamber_model import ChamberModel, Ramp, fit, ramps_of
 from stand.estimating.durations import Situation, expect
 
 LEARNED_FILE = "learned.json"
+_KIND = "learned"
 _NIGHTS = 5  # as far back as a stand is likely to be as it is now
 
 
@@ -52,7 +54,7 @@ def load_learned(directory: Path) -> Learned:
     """What is kept in `directory`; defaults when there is nothing or nothing that can be read: an estimate is no
     reason not to run, and the file is rewritten at the end of each."""
     try:
-        return Learned.model_validate_json((directory / LEARNED_FILE).read_bytes())
+        return Learned.model_validate_json(unseal(_KIND, (directory / LEARNED_FILE).read_bytes()))
     except (OSError, ValueError):
         return Learned()
 
@@ -156,6 +158,6 @@ def _done(marks: Iterable[StepMark]) -> Iterator[tuple[StepMark, float | None]]:
 
 def _replace(path: Path, text: str) -> None:
     try:
-        replace_file(path, text.encode())
+        replace_file(path, seal(_KIND, text))
     except OSError as error:
         raise SessionError(f"{path}: cannot be written ({error.strerror})") from error

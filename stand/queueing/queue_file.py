@@ -1,6 +1,7 @@
 """The file of a queue of runs, `queue.json` in the recording directory, and its locks.
 
-The file is replaced as a whole, and what it was before stays beside it as `queue.json.last`. `.queue.lock` is locked
+The file is replaced as a whole, and then what it was before is put beside it as `queue.json.last`: two that are the
+same are a change that the disk has lost. `.queue.lock` is locked
 (flock) while it is read or changed, `.queue.worker` as long as a process runs the queue: a run that is marked as
 running when none does was interrupted.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,14 +22,17 @@ from foundation.document_faults import path_text
 from foundation.documents import Document
 from foundation.errors import NotThere, SessionError
 from foundation.files import replace_file
+from foundation.sealed import seal, unseal
 
 QUEUE_NAME = "queue.json"
 LAST_NAME = "queue.json.last"
 KEPT_ENDED = 100
 """So many of the runs that have ended stay in the file, the latest: with its three texts a run has 9 kB, and the whole
 file is written at each change. What was run stays in its session."""
+_KIND = "queue"
 _LOCK_NAME = ".queue.lock"
 _WORKER_NAME = ".queue.worker"
+_REMEDY = f"{LAST_NAME} beside it is the queue before its last change: rename it to {QUEUE_NAME}, or move both away"
 
 
 class State(StrEnum):
@@ -89,11 +93,13 @@ class Entry(Document):
 class Queue(Document):
     """The whole file. entries: what has ended, then the running one, then what is to be done in its order.
 
-    next_id: no number is given twice. halted: why nothing is begun until an operator says so, "" when it may be.
+    next_id: no number is given twice. changes: how often it was changed, so that no two states are the same.
+    halted: why nothing is begun until an operator says so, "" when it may be.
     """
 
     version: Literal[1] = 1
     next_id: int = Field(default=1, ge=1)
+    changes: int = Field(default=0, ge=0)
     halted: str = ""
     entries: tuple[Entry, ...] = ()
 
@@ -122,7 +128,7 @@ class Draft:
 
 def read_queue(directory: Path) -> Queue:
     """The queue of a recording directory, an empty one when there is none; SessionError when it cannot be read."""
-    if not (directory / QUEUE_NAME).exists():
+    if not any((directory / name).exists() for name in (QUEUE_NAME, LAST_NAME)):
         return Queue()
     with _locked(directory):
         return _settled(directory, _load(directory))
@@ -186,19 +192,27 @@ def _interrupted(queue: Queue) -> Queue:
 
 
 def _load(directory: Path) -> Queue:
-    path = directory / QUEUE_NAME
+    path, last = directory / QUEUE_NAME, directory / LAST_NAME
     try:
-        return Queue.model_validate_json(path.read_bytes())
+        data = path.read_bytes()
+        if last.is_file() and last.read_bytes() == data:
+            raise SessionError(
+                f"{path}: the disk has lost its last change; look at what is queued, then remove {LAST_NAME} beside it"
+            )
+        return Queue.model_validate_json(unseal(_KIND, data))
     except FileNotFoundError:
-        return Queue()
+        if not last.exists():
+            return Queue()
+        raise SessionError(f"{path}: is missing; {_REMEDY}") from None
     except OSError as error:
         raise SessionError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValidationError as error:
-        remedy = f"{LAST_NAME} beside it is the queue before its last change: put it in its place, or move both away"
-        raise SessionError(f"{path}: is damaged ({_first_fault(error)}); {remedy}") from error
+    except ValueError as error:
+        raise SessionError(f"{path}: is damaged ({_first_fault(error)}); {_REMEDY}") from error
 
 
-def _first_fault(error: ValidationError) -> str:
+def _first_fault(error: ValueError) -> str:
+    if not isinstance(error, ValidationError):
+        return str(error)
     fault = error.errors()[0]
     where = path_text(fault["loc"])
     return f"{where}: {fault['msg']}" if where else fault["msg"]
@@ -207,11 +221,14 @@ def _first_fault(error: ValidationError) -> str:
 def _store(directory: Path, queue: Queue) -> None:
     path = directory / QUEUE_NAME
     try:
-        if path.exists():
-            replace_file(directory / LAST_NAME, path.read_bytes())
-        replace_file(path, queue.model_dump_json(indent=1).encode() + b"\n")
+        before = path.read_bytes() if path.exists() else None
+        queue = queue.model_copy(update={"changes": queue.changes + 1})
+        replace_file(path, seal(_KIND, queue.model_dump_json(indent=1)))
     except OSError as error:
         raise SessionError(f"{path}: cannot be written ({error.strerror}); the queue is as it was") from error
+    if before is not None:
+        with suppress(OSError):  # an older state is there, or none
+            replace_file(directory / LAST_NAME, before)
 
 
 @contextmanager

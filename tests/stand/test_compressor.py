@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.clock import Boot, seconds_ns
+from foundation.sealed import seal
 from stand.chamber.compressor import CompressorState, decide, keep, restored
 from stand.config.stand_config import CompressorConfig
 
@@ -110,11 +111,6 @@ def test_a_file_of_another_boot_means_switched_off_just_now(tmp_path: Path, kept
     assert restored(tmp_path / "file", NOW_NS, read_by) == CompressorState(False, NOW_NS)
 
 
-def test_virtual_time_keeps_no_boot_and_a_daemon_of_before_could_read_it(tmp_path: Path):
-    keep(tmp_path / "file", CompressorState(False, 7, (3, 5)), None)
-    assert (tmp_path / "file").read_text() == '{"running": false, "since_ns": 7, "starts_ns": [3, 5]}'
-
-
 def test_writers_at_once_do_not_meet_and_the_latest_call_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The disk hangs under the first; the second is done before it."""
     path, hangs, goes_on, sync = tmp_path / "file", threading.Event(), threading.Event(), os.fsync
@@ -146,7 +142,8 @@ def test_writers_at_once_do_not_meet_and_the_latest_call_stays(tmp_path: Path, m
         b"[]",
         b'{"running": false}',
         b'{"running": 0, "since_ns": "x", "starts_ns": []}',
-        b'{"running": false, "since_ns": 1, "starts_ns": [], "boot_id": 5}',
+        seal("compressor", '{"running": false, "since_ns": 1, "starts_ns": [], "boot_id": 5}'),
+        b'{"running": false, "since_ns": 1, "starts_ns": []}',
         b"\xff",
     ],
 )

@@ -17,6 +17,7 @@ from stand.queueing import queue
 from stand.queueing.queue_file import KEPT_ENDED, LAST_NAME, QUEUE_NAME, State, changing, working
 from stand.running.order import Order, load_order
 from tests import forked
+from tests.recording.disks import limit_files
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -267,7 +268,15 @@ def test_two_processes_at_once_lose_nothing(tmp_path: Path):
     assert sorted(number for number, _ in states(tmp_path)) == list(range(1, 41))
 
 
-@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: b"\xff" + data])
+DAMAGES = [
+    lambda data: b"",
+    lambda data: data[: len(data) // 2],
+    lambda data: b"\xff" + data,
+    lambda data: data.replace(b'"waiting"', b'"failed" '),  # as a sector of an earlier state has it
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_named_left_alone_and_can_be_put_right(tmp_path: Path, damage):
     add(tmp_path)
     add(tmp_path)
@@ -279,16 +288,49 @@ def test_a_damaged_file_is_named_left_alone_and_can_be_put_right(tmp_path: Path,
             attempt()
         assert "\n" not in str(caught.value)
     assert path.read_bytes() == damaged
-    path.write_bytes((tmp_path / LAST_NAME).read_bytes())
+    (tmp_path / LAST_NAME).rename(path)
+    assert states(tmp_path) == [(1, "waiting")]
+
+
+def test_a_queue_that_is_gone_or_as_it_was_before_its_last_change_is_none_to_go_on_with(tmp_path: Path):
+    """A disk may forget the last rename, or a name, though both were synced."""
+    for _ in range(3):
+        add(tmp_path)
+    path, last = tmp_path / QUEUE_NAME, tmp_path / LAST_NAME
+    path.write_bytes(last.read_bytes())
+    for attempt in (lambda: add(tmp_path), lambda: queue.queued(tmp_path)):
+        with pytest.raises(SessionError, match=r"lost its last change; .* then remove queue\.json\.last"):
+            attempt()
+    path.unlink()
+    for attempt in (lambda: add(tmp_path), lambda: queue.queued(tmp_path)):
+        with pytest.raises(SessionError, match=r"is missing; queue\.json\.last beside it is .*: rename it"):
+            attempt()
+    last.rename(path)
+    assert states(tmp_path) == [(1, "waiting"), (2, "waiting")]
+
+
+def test_a_change_that_is_taken_back_is_no_change_that_was_lost(tmp_path: Path):
+    add(tmp_path)
+    first = (tmp_path / QUEUE_NAME).read_bytes()
+    for reason in ("a trip", ""):
+        with changing(tmp_path) as draft:
+            draft.set(halted=reason)
+    (tmp_path / LAST_NAME).write_bytes(first)  # the power failed before that of the last change was there
     assert states(tmp_path) == [(1, "waiting")]
 
 
 def test_a_disk_that_refuses_leaves_the_queue_as_it_was(tmp_path: Path):
     add(tmp_path)
-    (tmp_path / LAST_NAME).mkdir()  # in the way of the new file, as a full disk would be
-    with pytest.raises(SessionError, match=r"cannot be written \(Is a directory\); the queue is as it was"):
-        add(tmp_path)
+    limit_files(1000)
+    try:
+        with pytest.raises(SessionError, match=r"cannot be written \(File too large\); the queue is as it was"):
+            add(tmp_path)
+    finally:
+        limit_files()
     assert states(tmp_path) == [(1, "waiting")]
+    (tmp_path / LAST_NAME).mkdir()  # in the way of what it was before
+    add(tmp_path)
+    assert states(tmp_path) == [(1, "waiting"), (2, "waiting")]
 
 
 def test_looking_at_a_folder_without_a_queue_leaves_nothing_there(tmp_path: Path):

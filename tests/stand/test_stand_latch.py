@@ -49,6 +49,11 @@ def nulled(path: Path) -> None:
     path.write_text('{"rule": null, "text": "x", "since_ns": 5}')
 
 
+def of_an_earlier_fault(path: Path) -> None:
+    """A sector of the file as it was before, at the begin of what is there now."""
+    path.write_bytes(whole(path).replace(b"61.00", b"58.00"))
+
+
 def emptied(path: Path) -> None:
     path.write_bytes(b"")
 
@@ -65,7 +70,10 @@ def of_another_shape(path: Path) -> None:
     path.write_text("[]")
 
 
-@pytest.mark.parametrize("spoil", [halved, zeroed, nulled, emptied, linked, made_a_folder, of_another_shape])
+SPOILT = [halved, zeroed, nulled, of_an_earlier_fault, emptied, linked, made_a_folder, of_another_shape]
+
+
+@pytest.mark.parametrize("spoil", SPOILT)
 def test_one_that_cannot_be_read_counts_as_latched_and_can_be_cleared(path: Path, spoil: Callable[[Path], None]):
     path.parent.mkdir()
     spoil(path)
@@ -115,3 +123,10 @@ def test_it_belongs_to_what_heats_and_not_to_a_name_or_a_folder(tmp_path: Path, 
     assert of(axes={}, cameras={}).read() is not None
     assert of(bus=data["bus"] | {"address": "tcp:127.0.0.1:5999"}).read() is None
     assert state_folder() == tmp_path / "thermostand"
+    for path in state_folder().iterdir():  # a disk that has forgotten any one of its files
+        content = path.read_bytes()
+        path.unlink()
+        assert of().read() is not None
+        path.write_bytes(content)
+    assert of().forget() == ""
+    assert list(state_folder().iterdir()) == []

@@ -1,8 +1,8 @@
 """A fault that nobody has cleared, on this computer's disk: it belongs to the stand, not to a process or a recording.
 
-One file for each address of what heats and cools, so that it is found again whatever the folder of the sessions, the
-configuration's name or the program that asks. It is on the disk before anything is said of the fault. A file that
-cannot be read counts as a fault: nobody knows what it held.
+Two files for each address of what heats and cools, so that it is found again whatever the folder of the sessions, the
+configuration's name or the program that asks, and when the disk forgets one of them. They are on the disk before
+anything is said of the fault. A file that cannot be read counts as a fault: nobody knows what it held.
 """
 
 from __future__ import annotations
@@ -14,16 +14,19 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from foundation.errors import SessionError
 from foundation.files import replace_file, sync_folder
+from foundation.sealed import seal, unseal
 from stand.config.stand_config import StandConfig
 from stand.fault import Fault
 from stand.running.opening.claim import addresses, file_name
 
 SYSTEM_FOLDER = Path("/var/lib/thermostand")
 UNREADABLE = "latch_unreadable"
+_KIND = "latch"
+_ENDS = (".latched.json", ".again.latched.json")  # each synced by itself: what is lost at once is one of them
 _HEATING = ("bus", "regulator")  # of the addresses: two stands that share a camera are two stands
 _LONGEST_BYTES = 1_000_000
 WITHIN_S = 0.25
@@ -55,7 +58,7 @@ class StandLatch:
         """Of the stand of a configuration; asks the name service, as `addresses`."""
         folder = state_folder()
         places = sorted({each.place for each in addresses(config) if each.device in _HEATING})
-        return cls(folder / file_name(place.partition(" in net:")[0], ".latched.json") for place in places)
+        return cls(folder / file_name(place.partition(" in net:")[0], end) for end in _ENDS for place in places)
 
     def read(self) -> LatchedFault | None:
         """The fault that nobody has cleared; None when there is none."""
@@ -71,17 +74,17 @@ class StandLatch:
             if found.st_size > _LONGEST_BYTES:
                 return _unreadable(path, "it is too long")
             try:
-                return LatchedFault.model_validate_json(path.read_bytes())
+                return LatchedFault.model_validate_json(unseal(_KIND, path.read_bytes()))
             except OSError as error:
                 return _unreadable(path, error.strerror)
-            except ValidationError:
+            except ValueError:
                 return _unreadable(path, "it is damaged")
         return None
 
     def keep(self, fault: Fault, since_ns: int) -> str:
         """Write it; "" when it is on the disk, else why it is not known to be."""
         text = LatchedFault(rule=fault.rule, text=fault.text, since_ns=since_ns).model_dump_json(indent=1)
-        return self._bounded(_write, text.encode() + b"\n")
+        return self._bounded(_write, seal(_KIND, text))
 
     def forget(self) -> str:
         """An operator has cleared it; as `keep`."""
