@@ -10,24 +10,27 @@ from __future__ import annotations
 
 import argparse
 import ast
+import importlib
+import multiprocessing
 import os
 import random
 import re
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
+import pytest
 import yaml
 
 from tests.addresses import WORKER
@@ -38,6 +41,7 @@ NOT_COPIED = shutil.ignore_patterns(".git", ".venv", ".hypothesis", ".*_cache")
 TORTURE = "tests/system/test_torture.py"
 MOST_LEFT = 0.05  # of those that are mistakes
 _LONGEST_S, _SLOWER, _AT_LEAST_S = 3600.0, 5.0, 60.0  # than without a mistake: beyond that it hangs
+_OURS = {path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()} | {"tests"}
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 _OTHER: dict[type, type] = {
     **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.LtE, ast.GtE: ast.Lt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
@@ -103,41 +107,39 @@ def mutant(file: str, source: str, number: int, which: int) -> Mutant:
     setattr(node, name, value)
     now = ast.unparse(ast.fix_missing_locations(whole))
     pairs = [pair for pair in zip(was.splitlines(), now.splitlines(), strict=True) if pair[0] != pair[1]]
-    return Mutant(file, getattr(node, "lineno", 0), *("\n".join(map(str.strip, part)) for part in zip(*pairs)), now)
+    texts = ("\n".join(pair[which].strip() for pair in pairs) for which in (0, 1))
+    return Mutant(file, getattr(node, "lineno", 0), *texts, now)
 
 
 class Copy:
-    """A copy of the project, in which mistakes are made one after the other; `number` tells those apart that are used
-    at once."""
+    """A copy of the project, in which mistakes are made one after the other, in a process of its own; `number` tells
+    those apart that are used at once. What others wrote is imported once: each run of tests is forked from there."""
 
     def __init__(self, folder: Path, number: int) -> None:
-        self.folder = folder / str(number)
+        self.folder = folder / f"copy-{number}"
         shutil.copytree(ROOT, self.folder, ignore=NOT_COPIED, symlinks=True)
-        self._env = {**os.environ, "PYTHONPATH": str(self.folder), WORKER: str(12 + number), "TMPDIR": str(folder)}
+        self._out = folder / f"out-{number}"
+        self._modules = folder / f"modules-{number}"
+        self._is_prepared = False
+        self._env = {"PYTHONPATH": str(self.folder), WORKER: str(12 + number), "TMPDIR": str(folder)}
 
     def found(self, names: str, limit_s: float) -> str:
         """The first test of those files that fails here, "" for none."""
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", *names.split()]
-        process = subprocess.Popen(
-            command,
-            cwd=self.folder,
-            env=self._env,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
-        try:
-            out, _ = process.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
+        tests = multiprocessing.get_context("fork").Process(target=self._run, args=(names.split(),))
+        tests.start()
+        tests.join(limit_s)
+        if not self._is_prepared and self._modules.is_file():
+            self._prepare()
+        if tests.exitcode is None:
+            os.killpg(tests.ident or 0, signal.SIGKILL)
+            tests.join()
             return f"{names.partition(' ')[0]} or after it (hung)"
-        if not process.returncode:
+        if not tests.exitcode:
             return ""
-        if process.returncode in (4, 5):
-            raise OSError(f"{' '.join(command)}: {out[-2000:]}")
-        return next(iter(_FAILED.findall(out)), f"exit status {process.returncode}")
+        out = self._out.read_text(encoding="utf-8", errors="replace")
+        if tests.exitcode in (4, 5):
+            raise OSError(f"{names}: {out[-2000:]}")
+        return next(iter(_FAILED.findall(out)), f"{names.partition(' ')[0]} or after it ({tests.exitcode})")
 
     def with_mistake(self, made: Mutant, stages: list[tuple[str, float]]) -> str:
         """What finds it of the stages (tests, and how long they may take), "" for nothing."""
@@ -149,6 +151,32 @@ class Copy:
         finally:
             path.write_bytes(right)
             shutil.rmtree(path.parent / "__pycache__", ignore_errors=True)
+
+    def _prepare(self) -> None:
+        """Import what the first run has imported of others."""
+        self._is_prepared = True
+        for name in self._modules.read_text(encoding="utf-8").split():
+            with suppress(Exception):
+                importlib.import_module(name)
+
+    def _run(self, names: list[str]) -> None:
+        """In a process of its own."""
+        os.setsid()
+        os.chdir(self.folder)
+        os.environ |= self._env
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        sys.dont_write_bytecode = False
+        sys.path.insert(0, str(self.folder))
+        for name in [name for name in sys.modules if name.partition(".")[0] in _OURS]:
+            del sys.modules[name]
+        with self._out.open("wb") as out:
+            os.dup2(out.fileno(), 1)
+            os.dup2(out.fileno(), 2)
+        tempfile.tempdir = None
+        status = pytest.main(["-x", "-q", "-n0", "--assert=plain", "-p", "no:cacheprovider", *names])
+        others = [name for name in sys.modules if name.partition(".")[0] not in {*_OURS, "__main__", "conftest"}]
+        self._modules.write_text("\n".join(others), encoding="utf-8")
+        sys.exit(status)
 
 
 def table() -> dict[str, Any]:
@@ -165,64 +193,71 @@ def drawn(files: list[str], count: int, seed: int) -> list[Mutant]:
     return [mutant(file, sources[file], *place) for file, *place in chosen]
 
 
-def limits_s(copy: Copy, stages: set[str]) -> dict[str, float]:
-    """How long each of these may take; all must pass in a copy as it is."""
-    limits: dict[str, float] = {}
-    for names in sorted(stages):
-        begun_s = time.monotonic()
-        if found := copy.found(names, _LONGEST_S):
-            raise SystemExit(f"{found} fails without any mistake")
-        limits[names] = _AT_LEAST_S + _SLOWER * (time.monotonic() - begun_s)
-    return limits
+_here: list[Copy] = []
+"""Of a process of the pool, the one it works in."""
+
+
+def _begin(folder: Path, numbers: SimpleQueue[int]) -> None:
+    _here.append(Copy(folder, numbers.get()))
+
+
+def _limited(names: str) -> tuple[str, float]:
+    """How long these tests may take; all must pass as it is."""
+    begun_s = time.monotonic()
+    if found := _here[0].found(names, _LONGEST_S):
+        raise SystemExit(f"{found} fails without any mistake")
+    return names, _AT_LEAST_S + _SLOWER * (time.monotonic() - begun_s)
+
+
+def _looked(made: Mutant, stages: list[tuple[str, float]]) -> str:
+    return _here[0].with_mistake(made, stages)
 
 
 def main() -> int:
     """1 when more than one in twenty was not found."""
     parser = argparse.ArgumentParser(prog="python -m tests.torture.mutants", description="Are mistakes found?")
     known = table()
-    equivalent = {(each["file"], each["was"], each["now"]): each["why"] for each in known["equivalent"]}
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--of", nargs="+", default=list(known["tests"]))
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     begun_s, how = time.monotonic(), Counter[str]()
-    made = drawn(given.of, given.count, given.seed)
-    with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(given.jobs) as pool:
-        free = SimpleQueue[Copy]()
-        for number in range(given.jobs):
-            free.put(Copy(Path(folder), number))
-        copy = free.get()
-        stages = {file: [*known["tests"][file], TORTURE] for file in given.of}
-        limits = limits_s(copy, {names for each in stages.values() for names in each})
-        free.put(copy)
-
-        def look(each: Mutant) -> str:
-            if (each.file, each.was, each.now) in equivalent:
-                return "equivalent"
-            copy = free.get()
-            try:
-                return copy.with_mistake(each, [(names, limits[names]) for names in stages[each.file]])
-            finally:
-                free.put(copy)
-
-        for count, (each, found) in enumerate(zip(made, pool.map(look, made), strict=True), 1):
+    none = {(each["file"], each["was"], each["now"]) for each in known["equivalent"]}
+    every = drawn(given.of, given.count, given.seed)
+    made = [each for each in every if (each.file, each.was, each.now) not in none]
+    stages = {file: [*known["tests"][file], TORTURE] for file in given.of}
+    context = multiprocessing.get_context("spawn")
+    numbers: SimpleQueue[int] = context.SimpleQueue()
+    for number in range(given.jobs):
+        numbers.put(number)
+    with (
+        tempfile.TemporaryDirectory(prefix="mutants-") as folder,
+        ProcessPoolExecutor(given.jobs, context, _begin, (Path(folder), numbers)) as pool,
+    ):
+        limits = dict(pool.map(_limited, sorted({names for each in made for names in stages[each.file]})))
+        looks = [pool.submit(_looked, each, [(names, limits[names]) for names in stages[each.file]]) for each in made]
+        for count, (each, look) in enumerate(zip(made, looks, strict=True), 1):
+            found = look.result()
             how[_kind(found)] += 1
             said = found or f"NOT FOUND\n    was: {each.was}\n    now: {each.now}"
             minutes_left = (time.monotonic() - begun_s) / count * (len(made) - count) / 60.0
             sys.stdout.write(f"[{count}/{len(made)}, {minutes_left:.0f} min left] {each.file}:{each.line}: {said}\n")
             sys.stdout.flush()
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    minutes, processor_min = (time.monotonic() - begun_s) / 60.0, (used.ru_utime + used.ru_stime) / 60.0
+    counts = ", ".join(f"{number} {name}" for name, number in how.most_common())
     sys.stdout.write(
-        f"{len(made)} drawn: {', '.join(f'{number} {name}' for name, number in how.most_common())}; "
-        f"{(time.monotonic() - begun_s) / 60.0:.0f} min, {(used.ru_utime + used.ru_stime) / 60.0:.0f} min of processor time\n"
+        f"{len(every)} drawn: {len(every) - len(made)} equivalent, {counts}; "
+        f"{minutes:.0f} min, {processor_min:.0f} min of processor time\n"
     )
-    return int(how["not found"] > MOST_LEFT * (len(made) - how["equivalent"]))
+    return int(how["not found"] > MOST_LEFT * len(made))
 
 
 def _kind(found: str) -> str:
-    if not found or found == "equivalent":
-        return found or "not found"
+    if not found:
+        return "not found"
     return "found by the torture rig" if found.startswith(TORTURE) else "found by tests"
 
 
