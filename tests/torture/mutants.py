@@ -107,8 +107,8 @@ def mutant(file: str, source: str, number: int, which: int) -> Mutant:
     setattr(node, name, value)
     now = ast.unparse(ast.fix_missing_locations(whole))
     pairs = [pair for pair in zip(was.splitlines(), now.splitlines(), strict=True) if pair[0] != pair[1]]
-    texts = ("\n".join(pair[which].strip() for pair in pairs) for which in (0, 1))
-    return Mutant(file, getattr(node, "lineno", 0), *texts, now)
+    texts = ["\n".join(pair[which].strip() for pair in pairs) for which in (0, 1)]
+    return Mutant(file, getattr(node, "lineno", 0), texts[0], texts[1], now)
 
 
 class Copy:
