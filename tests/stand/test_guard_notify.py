@@ -58,6 +58,24 @@ async def test_a_command_gets_a_trip_as_one_argument(tmp_path: Path, script: Cal
     assert [event.kind for event in bench.events] == ["guard.rule0"]
 
 
+async def test_a_hold_that_has_come_back_too_often_and_now_stays_is_told(tmp_path: Path, script: Callable[[str], str]):
+    reported = tmp_path / "reported"
+    bench = Bench("hold", command=(script(f'echo "$1" >> {reported}'),))
+    bench.guard.watches[0].ends_itself = True
+    latched: list[str] = []
+    bench.guard.latch = lambda fault: latched.append(fault.rule)
+    for _ in range(4):
+        bench.objecting = {0}
+        await bench.run_for(2)
+        bench.objecting = set()
+        await bench.run_for(2)
+    told = reported.read_text().splitlines()
+    assert told[:4] == ["it is so"] * 4
+    assert len(told) == 5
+    assert "more than 3 times in an hour, so it stays held" in told[4]
+    assert latched == ["rule0"]  # now it is for an operator
+
+
 async def test_a_run_that_is_taken_down_waits_until_somebody_was_notified(tmp_path: Path, script: Callable[[str], str]):
     """The guard ends at once, while the command still runs: it only can in real time."""
     reported = tmp_path / "reported"

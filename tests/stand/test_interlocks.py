@@ -66,10 +66,13 @@ def test_over_temperature_trips_above_its_limit(value: float, trips: bool):
 
 def test_a_camera_that_was_cut_off_too_warm_can_be_cleared_when_it_has_not_been_read_for_a_while():
     """Its supply is off and it will not be read; air that is not read is another rule's business."""
-    hub = hub_of(reading(94.0), Reading("camera.temperature", 94.0, "degC", 0), bad_reading(AIR, "degC", 1, "", "wire"))
+    read_ns = seconds_ns(1000)
+    hub = hub_of(
+        reading(94.0), Reading("camera.temperature", 94.0, "degC", read_ns), bad_reading(AIR, "degC", 1, "", "wire")
+    )
     camera, air = over_temperature("camera.temperature", 85.0, cuts_camera=True), over_temperature(AIR, 65.0)
-    assert camera(hub, seconds_ns(60)) is not None
-    assert camera(hub, seconds_ns(61)) is None
+    assert camera(hub, read_ns + seconds_ns(60)) is not None
+    assert camera(hub, read_ns + seconds_ns(61)) is None
     assert air(hub, seconds_ns(3600)) is not None
 
 

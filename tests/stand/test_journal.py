@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from foundation.clock import WallClock
 from foundation.errors import SessionError
 from stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, encode_line
-from stand.running.memory.journal import JOURNAL_NAME, Journal
+from stand.running.memory.journal import JOURNAL_NAME, Journal, taken_over
 from tests.journals import read_lines
 
 ENTRIES = [
@@ -209,6 +209,84 @@ async def test_notes_are_on_the_disk_in_their_order_when_the_journal_is_closed(t
     await journal.close()
     await journal.close()
     assert on_disk(tmp_path) == ENTRIES
+
+
+async def test_a_journal_that_was_removed_is_written_again_with_all_its_lines_and_stays_locked(tmp_path: Path):
+    reported: list[str] = []
+    journal, path = Journal.create(tmp_path), tmp_path / JOURNAL_NAME
+    journal.start(WallClock(), reported.append)
+    await journal.write(*ENTRIES[:2])
+    assert await journal.refound()  # it is there
+    path.unlink()
+    await journal.write(ENTRIES[2])
+    await journal.write(ENTRIES[3])
+    assert len(reported) == 1
+    assert "was removed or renamed" in journal.lost
+    assert not await journal.refound()
+    assert (journal.lost, on_disk(tmp_path)) == ("", ENTRIES[:2])
+    with pytest.raises(SessionError, match="is running this session"):
+        Journal.open(tmp_path)
+    await journal.write(ENTRIES[4])
+    assert await journal.refound()
+    await journal.close()
+    reopened, read = Journal.open(tmp_path)
+    reopened.release()
+    assert read == ENTRIES[:5]
+    assert [each.name for each in tmp_path.iterdir()] == [JOURNAL_NAME]
+
+
+async def test_a_journal_whose_folder_comes_back_goes_on_in_it(tmp_path: Path):
+    reported: list[str] = []
+    folder, hidden = tmp_path / "session", tmp_path / "hidden"
+    folder.mkdir()
+    journal = Journal.create(folder)
+    journal.start(WallClock(), reported.append)
+    await journal.write(ENTRIES[0])
+    folder.rename(hidden)
+    await journal.write(ENTRIES[1])
+    with pytest.raises(OSError, match="No such file"):
+        await journal.refound()
+    hidden.rename(folder)
+    assert await journal.refound()
+    await journal.write(ENTRIES[2])
+    await journal.close()
+    assert (len(reported), journal.lost, on_disk(folder)) == (1, "", ENTRIES[:3])
+
+
+async def test_what_is_noted_of_a_journal_that_is_closed_or_was_given_up_is_nothing(tmp_path: Path):
+    for number, ends in enumerate((Journal.close, Journal.abandon)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        journal = Journal.create(folder)
+        with pytest.raises(ValueError, match="is started before"):
+            await journal.write(ENTRIES[0])
+        journal.note(ENTRIES[0])
+        journal.start(WallClock(), pytest.fail)
+        await journal.write(ENTRIES[1])
+        ended = ends(journal)
+        if ended is not None:
+            await ended
+        journal.note(ENTRIES[2])
+        assert await journal.refound()
+        reopened, read = Journal.open(folder)  # nobody has it any more
+        reopened.release()
+        assert read == [ENTRIES[1]]
+
+
+def test_a_journal_that_somebody_else_has_is_not_taken_over_and_nothing_stays_open(tmp_path: Path):
+    journal = Journal.create(tmp_path)
+    files = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(BlockingIOError):
+        taken_over(tmp_path / JOURNAL_NAME, 0)
+    with pytest.raises(SessionError, match="is running this session"):
+        Journal.open(tmp_path)
+    assert len(os.listdir("/proc/self/fd")) == files
+    journal.release()
+    file = taken_over(tmp_path / JOURNAL_NAME, 0)
+    file.append(b"a line\n")
+    file.close()
+    file.close()
+    assert (tmp_path / JOURNAL_NAME).read_bytes() == b"a line\n"
 
 
 def test_a_pipe_in_its_place_is_refused_and_not_waited_for(tmp_path: Path):
