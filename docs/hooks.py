@@ -1,4 +1,5 @@
-"""Pages that are made when the site is: the references of the configuration files, from their schemas."""
+"""Pages that are made when the site is: the references of the configuration files, from their schemas, and what a stand
+says, from its table of events."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from stand.config.reference import reference
+from stand.watching.remedies import troubleshooting
 
 _PAGES = {
     "stand": "A stand's file",
@@ -26,4 +28,5 @@ def on_files(files: Files, config: Any) -> Files:
     for name, title in _PAGES.items():
         schema = json.loads((schemas / f"{name}.json").read_text(encoding="utf-8"))
         files.append(File.generated(config, f"reference-{name}.md", content=reference(title, schema)))
+    files.append(File.generated(config, "troubleshooting.md", content=troubleshooting()))
     return files

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from foundation.clock import NS_PER_S
+from foundation.events import always_published
 from foundation.items import Event
 
 FIRST, PERIOD_NS = 3, 1200 * NS_PER_S
@@ -26,19 +26,15 @@ class _Repeated:
 
 
 class RepeatLimit:
-    """Warnings and errors with the same kind and sentence, whatever its numbers, but for those of which each counts.
+    """Warnings and errors with the same kind and sentence, whatever its numbers, but for what is always published."""
 
-    counts: whether each event of its sort is to be published, as one that begins or ends a state of the stand.
-    """
-
-    def __init__(self, counts: Callable[[Event], bool]) -> None:
-        self._counts = counts
+    def __init__(self) -> None:
         self._repeated: dict[tuple[str, str], _Repeated] = {}
 
     def admit(self, event: Event) -> Event | None:
         """The event, with the number of those withheld before it in its data (`repeated`) and its text; None when it is
         withheld."""
-        if event.level == "info" or self._counts(event):
+        if event.level == "info" or always_published(event):
             return event
         now_ns, key = event.time_ns, (event.kind, _NUMBERS.sub("#", event.text))
         found = self._repeated.pop(key, None)

@@ -6,6 +6,8 @@ import asyncio
 from collections.abc import Callable
 from enum import StrEnum
 
+from foundation.events import CAMERA_ENDS, CLEAR, DISK, ROOM, Alert, event
+
 Listener = Callable[[str, bool], None]
 
 # What may hold a run; each reason is cleared by what has set it.
@@ -25,6 +27,31 @@ IN_WORDS = {
     NOT_RECORDED: "a disk that takes no telemetry",
     STOPPING: "the end of the run",
 }
+_STATUS = "`stand status` says what holds it, and what ends that"
+ENDINGS = {
+    OPERATOR: "`stand continue` ends the pause",
+    INTERLOCK: CLEAR,
+    CAMERA_LOST: CAMERA_ENDS,
+    DISK_LOW: ROOM,
+    NOT_RECORDED: DISK,
+}
+HELD = event(
+    "held",
+    "warning",
+    "held by {said}",
+    # What the guard says of its rule tells how that ends.
+    lambda data: (ENDINGS | {INTERLOCK: ""}).get(str(data.get("reason"))) or _STATUS,
+    counts=True,
+    cases=tuple({"reason": reason} for reason in ENDINGS),
+)
+RELEASED = event(
+    "released",
+    "info",
+    "no longer held by {said}",
+    alert=lambda data: Alert("hold", "guard", "over") if data.get("reason") == INTERLOCK else None,
+    counts=True,
+    cases=({"reason": INTERLOCK}, {"reason": OPERATOR}),
+)
 
 
 class Gate:

@@ -13,8 +13,8 @@ from drivers.devices.protocols import Actuator, Camera, Controller, Shutter, Swi
 from drivers.devices.regulators.heat_module import HeatModule
 from drivers.devices.thermometers import SeveralModules, Thermometers
 from foundation.clock import Clock
+from foundation.events import PROMPT, PROMPT_SKIPPED
 from foundation.hub import Hub
-from foundation.items import Event
 from stand.chamber.chamber import Chamber, ChamberLimits
 from stand.gate import OPERATOR, Gate
 from stand.imaging.camera_supply import CameraSupply, SupplyLimits
@@ -82,8 +82,8 @@ class Stand:
         """Ask the operator for something, and wait until it is done (a pause that the operator ends); when nobody
         attends the run continues, with the event `prompt_skipped`."""
         self.interlock.check()
-        self._hub.publish(Event(self._clock.now_ns(), "warning" if self.attended else "info", "prompt", text))
+        self._hub.publish(PROMPT.at(self._clock.now_ns(), what=text, attended=self.attended))
         if self.attended:
             self.gate.hold(OPERATOR)
             return await self.gate.passed()
-        self._hub.publish(Event(self._clock.now_ns(), "warning", "prompt_skipped", f"no operator; not done: {text}"))
+        self._hub.publish(PROMPT_SKIPPED.at(self._clock.now_ns(), what=text))

@@ -22,11 +22,11 @@ from foundation.output import output, show
 from foundation.usage import one_line
 from stand.commands.reached import ConfigOption, DirectoryArgument, TokenOption, UrlOption, on_stand, reached
 from stand.commands.sessions.session_text import size
-from stand.gate import INTERLOCK, STOPPING
+from stand.gate import ENDINGS, INTERLOCK, OPERATOR, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import FaultState, RunStatus, StandState
 from stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
-from stand.watching.remedies import for_reason, next_command
+from stand.watching.remedies import next_command
 
 app = App()
 
@@ -137,7 +137,7 @@ def clear(
     again, text = _held_again(server), str(answer.get("text") or "cleared")
     if again is not None:
         text = f"cleared; held again: {again.rule}: {again.text}"
-        _say(server, {**answer, "text": text, "reasons": [INTERLOCK]}, f"{text}; {for_reason(INTERLOCK)}")
+        _say(server, {**answer, "text": text, "reasons": [INTERLOCK]}, f"{text}; {ENDINGS[INTERLOCK]}")
     else:
         held = _still(answer) if answer.get("reasons") else "nothing holds the stand any more"
         _say(server, answer, f"{text}; {held}")
@@ -324,5 +324,5 @@ def _still(answer: Mapping[str, object]) -> str:
     reasons = cast("list[str]", answer.get("reasons", []))
     if not reasons:
         return "the run continues"
-    known = [remedy for reason in reasons if (remedy := for_reason(reason))]
+    known = [ENDINGS[reason] for reason in reasons if reason in (OPERATOR, INTERLOCK)]
     return "; ".join([f"still held: {', '.join(reasons)}", *known])

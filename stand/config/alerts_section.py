@@ -3,25 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 from pydantic import Field
 
 from foundation.documents import Document
+from foundation.events import AlertCause
 from stand.config.private_file import private_document
-
-Cause = Literal[
-    "trip",
-    "hold",
-    "device_lost",
-    "disk",
-    "prompt",
-    "run_started",
-    "run_finished",
-    "run_aborted",
-    "queue_empty",
-    "eta_slipped",
-]
 
 
 class AlertsConfig(Document):
@@ -33,7 +21,7 @@ class AlertsConfig(Document):
     """
 
     secrets: Path | None = None
-    causes: tuple[Cause, ...] = get_args(Cause)
+    causes: tuple[AlertCause, ...] = get_args(AlertCause)
     grace_s: float = Field(default=60.0, ge=0, le=3600)
     most_per_h: int = Field(default=20, ge=1, le=1000)
     alive_every_s: float = Field(default=300.0, ge=1, le=86400)

@@ -17,6 +17,7 @@ from pydantic import JsonValue
 from drivers.devices.relays import CAMERA_POWER
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
 from foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
+from foundation.events import RUN_FAILED
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.tasks import cancelled, failure_text, watched
@@ -36,7 +37,6 @@ from stand.running.opening.open_stand import OpenStand
 from stand.running.opening.stand_latch import LatchedFault
 from stand.running.opening.stop import STOPPED, catch_signals
 from stand.running.opening.writer_restarts import WriterRestarts
-from stand.serving.alert_book import RUN_FAILED
 from stand.serving.desk import Conflict
 
 # What answers the clients of a daemon while inside.

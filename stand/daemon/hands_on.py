@@ -21,12 +21,13 @@ from drivers.wires.modbus_unit import ModbusUnit
 from foundation.clock import WallClock, seconds_ns
 from foundation.errors import ConfigError, DeviceError, StandTripped
 from foundation.files import write_whole_bytes
+from foundation.hub import Hub
 from foundation.readings import Reading
+from foundation.repeats import RepeatLimit
 from recording.format.images import encode_png
 from stand.assembly import Assembly, assemble, device_kinds, register_map
 from stand.config.stand_config import StandConfig
 from stand.daemon.by_hand import ByHand
-from stand.message_limit import stand_hub
 from stand.running.opening.open_stand import at_bench, made_safe
 from stand.running.opening.stop import Stop
 from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb
@@ -47,7 +48,7 @@ class Done:
 
 def known_devices(config: StandConfig) -> tuple[DeviceState, ...]:
     """What there is, and what it takes; nothing is opened."""
-    devices = ByHand(assemble(config, stand_hub(), WallClock()), _no_heat).devices("")
+    devices = ByHand(assemble(config, Hub(RepeatLimit()), WallClock()), _no_heat).devices("")
     return tuple(each.model_copy(update={"verbs": (*_looks(config, each), *each.verbs)}) for each in devices)
 
 

@@ -12,6 +12,7 @@ from foundation.errors import StandTripped
 from foundation.files import make_folder
 from foundation.hub import Hub
 from foundation.items import Event
+from foundation.repeats import RepeatLimit
 from recording.repair.salvage import salvage_line, salvage_unfinished
 from recording.writing.disk import FILES_LINE
 from stand.assembly import assemble
@@ -24,7 +25,6 @@ from stand.daemon.daemon_file import KeptFile, kept_in
 from stand.daemon.day_record import DayRecord
 from stand.daemon.orders import Orders
 from stand.daemon.reports import Reports
-from stand.message_limit import stand_hub
 from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
 from stand.running.opening.open_stand import opened
@@ -52,7 +52,7 @@ async def serve(
     StandTripped when the stand could not be confirmed safe at the end.
     """
     async with Stop() as stop, claimed(config, None):
-        hub, clock = stand_hub(), WallClock()
+        hub, clock = Hub(RepeatLimit()), WallClock()
         await asyncio.to_thread(make_folder, out)
         kept, damage = await asyncio.to_thread(kept_in, out)
         latched = await asyncio.to_thread(StandLatch.of(config).read)

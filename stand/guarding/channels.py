@@ -15,12 +15,23 @@ from dataclasses import dataclass, field, replace
 from statistics import median
 
 from foundation.clock import NS_PER_S
+from foundation.events import SENSOR, guard_rule
 from foundation.items import Event
 from foundation.readings import Quality, Reading
 from stand.config.chamber_section import FrozenConfig
 from stand.config.guard_section import SensorsConfig
 from stand.fault import Fault
+from stand.guarding.interlocks import SENSOR_STALE
+from stand.guarding.plausibility import SENSOR_STUCK
 
+SENSOR_JUMPED = guard_rule("sensor_jumped", "a temperature jumped by more than a body can", SENSOR)
+SENSOR_OUTSIDE = guard_rule("sensor_outside", "a temperature is where it cannot be", SENSOR)
+SENSOR_NOISY = guard_rule("sensor_noisy", "a temperature is noisier than it was", SENSOR)
+SENSOR_IMPLAUSIBLE = guard_rule(
+    "sensor_implausible",
+    "a camera is warmer or colder than its own heat can make it",
+    "state `self_heating_K` of the camera in the stand's file, if that is how it is; " + SENSOR,
+)
 Poll = tuple[Reading, ...]
 
 _DRIVE_K = 50.0
@@ -171,7 +182,7 @@ class ChannelCheck:
         was = seen.doubted
         self._follow(seen, nature, value, time_ns)
         has_jumped = abs(_beyond(seen, value, time_ns)) > self._allowed_K(seen, nature, time_ns)
-        if was is not None and was.rule == "sensor_jumped":
+        if was is not None and was.rule == SENSOR_JUMPED:
             self._watch_return(channel, seen, was, value, time_ns, has_jumped=has_jumped)
         elif was is None and has_jumped:
             self._jump(channel, seen, value, time_ns, (seen.time_ns, seen.value))
@@ -229,7 +240,7 @@ class ChannelCheck:
             seen, nature
         )  # what a slow body was on the way counts not
         before_K = since[1] - self._believed_degC(nature.follows) if is_known else math.nan
-        seen.doubted = _Doubted(Fault("sensor_jumped", text, "warn"), time_ns, went_K, before_K)
+        seen.doubted = _Doubted(Fault(SENSOR_JUMPED, text, "warn"), time_ns, went_K, before_K)
         seen.recent.clear()  # no trend leads over a jump
 
     def _watch_return(
@@ -263,8 +274,8 @@ class ChannelCheck:
         )
         was = seen.doubted
         if found is None:
-            seen.doubted = was if was is not None and was.rule == "sensor_jumped" else None
-        elif was is None or was.rule not in (found.rule, "sensor_jumped") or found.rule == "sensor_noisy" != was.rule:
+            seen.doubted = was if was is not None and was.rule == SENSOR_JUMPED else None
+        elif was is None or was.rule not in (found.rule, SENSOR_JUMPED) or found.rule == SENSOR_NOISY != was.rule:
             seen.doubted = found
 
     def _outside(self, channel: str, seen: _Seen, nature: Nature) -> _Doubted | None:
@@ -272,19 +283,19 @@ class ChannelCheck:
         if low_degC <= seen.value <= high_degC:
             return None
         text = f"{channel} is {seen.value:.2f} degC, outside {low_degC:g}..{high_degC:g} degC"
-        return _Doubted(Fault("sensor_outside", text, "warn"), seen.time_ns)
+        return _Doubted(Fault(SENSOR_OUTSIDE, text, "warn"), seen.time_ns)
 
     def _noisy(self, channel: str, seen: _Seen) -> _Doubted | None:
         last = list(seen.polled)
         if len(last) < _NOISE_POLLS + 2:
             return None
         bends_K = [abs(c - 2 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)]
-        was_noisy = seen.doubted is not None and seen.doubted.rule == "sensor_noisy"
+        was_noisy = seen.doubted is not None and seen.doubted.rule == SENSOR_NOISY
         limit_K = _NOISE_K * (0.5 if was_noisy else 1.0) + 2 * _step_K(seen)
         if median(bends_K) <= limit_K:
             return None
         text = f"{channel} scatters by {median(bends_K) / 1.65:.1f} K from reading to reading"
-        return _Doubted(Fault("sensor_noisy", text, "warn"), seen.time_ns)
+        return _Doubted(Fault(SENSOR_NOISY, text, "warn"), seen.time_ns)
 
     def _stuck(self, channel: str, seen: _Seen, nature: Nature, fine_K: float) -> _Doubted | None:
         """Exactly constant: for long, where the device shows steps so fine that noise must move it; or since what it
@@ -292,7 +303,7 @@ class ChannelCheck:
         frozen, still_s = self._frozen, (seen.time_ns - seen.changed_ns) / NS_PER_S
         if fine_K <= frozen.step_K and still_s >= self._sensors.stuck_after_s:
             text = f"{channel} has been exactly {seen.value:.3f} degC for {self._sensors.stuck_after_s:g} s"
-            return _Doubted(Fault("sensor_stuck", text, "warn"), seen.time_ns)
+            return _Doubted(Fault(SENSOR_STUCK, text, "warn"), seen.time_ns)
         went_K = seen.followed_degC[1] - seen.followed_degC[0]
         step_K = 0.0 if math.isinf(seen.step_K) else seen.step_K
         share = _share(frozen.camera_after_s, nature.lag_s)
@@ -305,7 +316,7 @@ class ChannelCheck:
         if (seen.time_ns - seen.went_ns) / NS_PER_S < frozen.camera_after_s:
             return None
         text = f"{channel} stays at {seen.value:g} while {nature.follows} went by {went_K:.1f} K; it is stale"
-        return _Doubted(Fault("sensor_stale", text, "warn"), seen.time_ns)
+        return _Doubted(Fault(SENSOR_STALE, text, "warn"), seen.time_ns)
 
     def _is_at_rest(self, seen: _Seen, nature: Nature) -> bool:
         """A slow body, on for long in air that has not moved for long, and still itself."""
@@ -325,20 +336,20 @@ class ChannelCheck:
         above = f"{channel} is {excess_K:+.1f} K from {nature.follows}, both at rest"
         if not low_K - slack_K <= excess_K <= high_K + slack_K:
             wanted = f"{low_K:g} to {high_K:g} K" if math.isfinite(high_K) else f"more than {low_K:g} K"
-            return _Doubted(Fault("sensor_implausible", f"{above}; {wanted} are expected", "warn"), seen.time_ns)
+            return _Doubted(Fault(SENSOR_IMPLAUSIBLE, f"{above}; {wanted} are expected", "warn"), seen.time_ns)
         if math.isnan(seen.rest_K) and seen.doubted is None:
             seen.rest_K = excess_K
         if abs(excess_K - seen.rest_K) > _EXCESS_K:
             return _Doubted(
-                Fault("sensor_implausible", f"{above}; it was {seen.rest_K:+.1f} K before", "warn"), seen.time_ns
+                Fault(SENSOR_IMPLAUSIBLE, f"{above}; it was {seen.rest_K:+.1f} K before", "warn"), seen.time_ns
             )
         return None
 
     def _tell(self, began: list[tuple[str, _Doubted]], module: str, channels: list[str], now_ns: int) -> None:
         """One event for what jumps at one instant, one for each that is doubted for another reason."""
-        jumped = [(channel, doubted) for channel, doubted in began if doubted.rule == "sensor_jumped"]
+        jumped = [(channel, doubted) for channel, doubted in began if doubted.rule == SENSOR_JUMPED]
         for channel, doubted in began:
-            if doubted.rule != "sensor_jumped":
+            if doubted.rule != SENSOR_JUMPED:
                 self._warn(doubted.rule, [channel], doubted.text, now_ns, {})
         if not jumped:
             return
@@ -364,7 +375,7 @@ class ChannelCheck:
                 f"{len(jumped)} of {len(channels)} temperatures of {module} moved in one poll: look at that module, "
                 f"its range and its supply, not at single cables: {text}"
             )
-        self._warn("sensor_jumped", names, text, now_ns, moved)
+        self._warn(SENSOR_JUMPED, names, text, now_ns, moved)
 
     def _are_exchanged(self, jumped: list[tuple[str, _Doubted]]) -> bool:
         if len(jumped) != 2:

@@ -9,11 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.events import SENSOR, guard_rule
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 from stand.guarding.suspects import Suspicion
 
+SENSOR_DRIFTS = guard_rule("sensor_drifts", "two sensors of the same air drift apart while it is at rest", SENSOR)
 _NEAR_K = 1.0  # of the set-point, or it is not held
 _STILL_AFTER_S, _MEAN_S = 3600.0, 600.0  # walls have followed by then; over which a mean is taken
 
@@ -70,7 +72,7 @@ def drifting(
                 f"{hours:.1f} h ({1e3 * changes_K[0] / hours:+.1f} mK/h)"
             )
             found = _suspicion(changes_K)
-            fault = Fault("sensor_drifts", text + found.words(pair), channels=pair, suspect=found.suspect)
+            fault = Fault(SENSOR_DRIFTS, text + found.words(pair), channels=pair, suspect=found.suspect)
         return _Held(held.key, now_ns - seconds_ns(_STILL_AFTER_S), first=known, fault=fault)
 
     def _suspicion(changes_K: Sequence[float]) -> Suspicion:

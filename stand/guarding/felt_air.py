@@ -13,11 +13,15 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.events import guard_rule
 from stand.config.chamber_section import CameraFeelsConfig, GraniteFeelsConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
+AIR_WARMER_THAN_SHOWN = guard_rule(
+    "air_warmer_than_shown", "a body in the chamber warms as if the air were warmer than shown"
+)
 _COVERAGE = 3.0  # with 1 K of noise in the granite its rate says nothing of the air
 _GAP_S = 60.0  # between two readings; after a longer one the window begins again
 
@@ -128,7 +132,7 @@ def granite_feels(limits: GraniteFeelsConfig, lag_s: float, granite: str, probe:
 
 def _objection(found: Felt, body: str, probe: str) -> Fault:
     text = f"{body} warms as in air of {found.air_degC:.1f} degC, but {probe} shows {found.probe_degC:.1f} degC"
-    return Fault("air_warmer_than_shown", text)
+    return Fault(AIR_WARMER_THAN_SHOWN, text)
 
 
 @dataclass(frozen=True, slots=True)

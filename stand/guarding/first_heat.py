@@ -6,12 +6,14 @@ import math
 from dataclasses import dataclass, replace
 
 from foundation.clock import seconds_ns
+from foundation.events import guard_rule
 from stand.config.chamber_section import FirstHeatConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
+FIRST_HEAT = guard_rule("first_heat", "the first heat is not felt where it is given")
 _LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds
 
 
@@ -58,7 +60,7 @@ def first_heat(limits: FirstHeatConfig, air: str, regulator: str, permit: str) -
             f"{name} rose by {risen_K:.1f} K" for name, risen_K in zip((pv, air), state.risen_K, strict=True)
         )
         text = f"in the first {limits.within_s:g} s of heat {rises}; both should rise by {limits.rise_K:g} K"
-        return None, Fault("first_heat", f"{text}: is this regulator the one of this chamber?")
+        return None, Fault(FIRST_HEAT, f"{text}: is this regulator the one of this chamber?")
 
     return remembering(step)
 

@@ -7,9 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from foundation.clock import seconds_ns
+from foundation.events import guard_rule
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
+
+SENSOR_FROZEN = guard_rule("sensor_frozen", "a temperature has not moved at all while the regulator's output works")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +45,7 @@ def frozen(channel: str, module: tuple[str, ...], step_K: float, after_s: float,
         if state.step_K > step_K or now_ns - state.since_ns < seconds_ns(after_s):
             return state, None
         text = f"{channel} has been exactly {value:.3f} degC for {after_s:g} s while the regulator's output works"
-        return state, Fault("sensor_frozen", text)
+        return state, Fault(SENSOR_FROZEN, text)
 
     return remembering(step)
 

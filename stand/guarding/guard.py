@@ -12,14 +12,16 @@ from dataclasses import dataclass, field
 
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError
+from foundation.events import guard_rule
 from foundation.hub import Hub
 from foundation.items import Event
 from stand.fault import Fault
-from stand.guarding.interlocks import NOT_DURABLE, Watch
+from stand.guarding.interlocks import NOT_RECORDED, Watch
 from stand.guarding.met_errors import MetErrors
 from stand.guarding.notify import Notifier
 from stand.safety import Safety
 
+_GUARD_FAILED = guard_rule("guard_failed", "the guard itself has failed")
 LATE_PERIODS = 2
 _STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stopped is read within this after it continues
 _ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more often needs an operator
@@ -129,7 +131,7 @@ class Guard:
         """Nothing is recorded from now on. A hold for what was not on the disk in time ends with that, and its cause
         may last."""
         fault = self.held
-        if fault is None or fault.rule != NOT_DURABLE or not fault.ends_itself or self.release is None:
+        if fault is None or fault.rule != NOT_RECORDED or not fault.ends_itself or self.release is None:
             return
         self.held = None
         text = f"the recording ended while the disk held it up; nothing is heated before another begins: {fault.text}"
@@ -147,7 +149,7 @@ class Guard:
                 await self.clock.sleep_until(due_ns)
         except Exception as error:
             self.keeps_on = False
-            self._abort(Fault("guard_failed", f"the guard failed ({type(error).__name__}: {error})"))
+            self._abort(Fault(_GUARD_FAILED, f"the guard failed ({type(error).__name__}: {error})"))
             raise
 
     @property

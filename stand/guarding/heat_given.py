@@ -6,11 +6,14 @@ import math
 from dataclasses import dataclass
 
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.events import guard_rule
 from stand.config.chamber_section import ChamberConfig, HeatFeltConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
+HEAT_NOT_FELT = guard_rule("heat_not_felt", "the regulator heats hard, and a probe does not show it")
+TOO_MUCH_HEAT = guard_rule("too_much_heat", "more heat was given within an hour than the chamber ever needs")
 _LONGEST_LOOK_S = 60.0  # between two looks; what was given in a longer gap is not known
 _BEFORE_S = 30.0  # a stretch of heat begins: from here on a fall counts
 _MINUTE_S = 60.0
@@ -48,7 +51,7 @@ def too_much_heat(max_Wh_per_h: float, heater_W: float, regulator: str, permit: 
         if given_Wh <= max_Wh_per_h:
             return state, None
         text = f"{given_Wh:.0f} Wh of heat were given within an hour, above the limit of {max_Wh_per_h:g} Wh"
-        return state, Fault("too_much_heat", text)
+        return state, Fault(TOO_MUCH_HEAT, text)
 
     return remembering(step)
 
@@ -110,7 +113,7 @@ def _fallen(stretch: Stretch, limits: HeatFeltConfig, probe: str) -> Fault | Non
     if stretch.highest_degC - now.probe_degC < limits.fall_K:
         return None
     text = f"{probe} falls from {stretch.highest_degC:.1f} to {now.probe_degC:.1f} degC while the regulator heats"
-    return Fault("heat_not_felt", f"{text} by {now.percent:.0f} %")
+    return Fault(HEAT_NOT_FELT, f"{text} by {now.percent:.0f} %")
 
 
 def _not_risen(
@@ -131,4 +134,4 @@ def _not_risen(
     if risen_K >= needed_K:
         return None
     text = f"{probe} has risen by {risen_K:.2f} K in {lasted_s:.0f} s in which {given_Wh:.0f} Wh of heat were given"
-    return Fault("heat_not_felt", f"{text}; at least {needed_K:.2f} K are expected")
+    return Fault(HEAT_NOT_FELT, f"{text}; at least {needed_K:.2f} K are expected")

@@ -8,12 +8,41 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.events import CONNECTED, SENSOR, guard_rule
 from foundation.readings import Quality
 from stand.fault import Action, Fault, Readings, value_of
 
-RECORDING_ENDED = "recording_ended"  # the rule after which a run is resumed by itself (writer_restarts.py)
-DEVICE_FAULT, STAGE_ALARM = "device_fault", "stage_alarm"
-NOT_DURABLE = "not_recorded"  # the rule that ends its hold when the disk has caught up
+OVER_TEMPERATURE = guard_rule("over_temperature", "a temperature is above its limit")
+SENSOR_MISSING = guard_rule("sensor_missing", "a temperature that heat depends on was never read", CONNECTED)
+SENSOR_BAD = guard_rule("sensor_bad", "a device says that it has no measurement", CONNECTED)
+SENSOR_STALE = guard_rule("sensor_stale", "a temperature was last good too long ago", CONNECTED)
+SENSORS_DISAGREE = guard_rule("sensors_disagree", "two sensors of the same air differ", SENSOR)
+DEVICE_FAULT = guard_rule("device_fault", "a device reports a fault, or a setting that somebody changed")
+REGULATOR_STOPPED = guard_rule("regulator_stopped", "the regulator does not control though heat is permitted")
+PERMIT_MISSING = guard_rule("permit_missing", "the relay that lets heat through is off though the regulator runs")
+STAGE_ALARM = guard_rule("stage_alarm", "a stage's controller has an alarm")
+SETTINGS_CHANGED = guard_rule(
+    "settings_changed",
+    "a stage's controller is set otherwise than its profile says",
+    "set the stage's controller as its profile says; `stand check` compares them",
+)
+DEW = guard_rule("dew", "the flap is open while water would settle on what is inside")
+CONTACT = guard_rule(
+    "contact",
+    "a contact of the stand is not as it should be",
+    "see to it where it is; `stand status` shows what it reads",
+)
+FLAP_OPEN = guard_rule("flap_open", "the flap is open and nothing excuses it")
+PAUSED_TOO_LONG = guard_rule("paused_too_long", "an operator has paused the run and not continued it")
+CAMERA_TEMPERATURE_BAD = guard_rule("camera_temperature_bad", "the camera has no temperature while frames are to come")
+DISK_LOW = guard_rule("disk_low", "the recorder takes no more frames")
+SWITCHED_ON_WITHOUT_PERMISSION = guard_rule(
+    "switched_on_without_permission", "others have switched heat, cold or the regulator on, twice"
+)
+HEAT_UNCONTROLLED = guard_rule("heat_uncontrolled", "the heat reads back other than commanded, and not off")
+NOT_RECORDED = guard_rule("not_recorded", "what was measured is not on the disk in time")
+FOLDER_LOST = guard_rule("folder_lost", "the folder of the session is not there any more")
+RECORDING_ENDED = guard_rule("recording_ended", "the process that writes the session has ended")
 _CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to clear that
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
 
@@ -62,7 +91,7 @@ def over_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False
             return None
         if value_degC > max_degC:
             text = f"{channel} is {value_degC:.2f} degC, above the limit of {max_degC} degC"
-            return Fault("over_temperature", text, cuts_camera=cuts_camera)
+            return Fault(OVER_TEMPERATURE, text, cuts_camera=cuts_camera)
         return None
 
     return rule
@@ -80,21 +109,21 @@ def trustworthy(channel: str, stale_after_s: float) -> Rule:
         nonlocal declined_ns
         reading, good_ns = readings.latest(channel), readings.last_good_ns(channel)
         if reading is None:
-            return Fault("sensor_missing", f"{channel} has never been read")
+            return Fault(SENSOR_MISSING, f"{channel} has never been read")
         is_bad = reading.quality is Quality.BAD
         if declined_ns is not None and good_ns is not None and good_ns > declined_ns:
             declined_ns = None
         if is_bad and reading.cause != "wire":
             if declined_ns is not None and reading.time_ns > declined_ns:
-                return Fault("sensor_bad", f"{channel} is BAD: {reading.reason}")
+                return Fault(SENSOR_BAD, f"{channel} is BAD: {reading.reason}")
             declined_ns = reading.time_ns
         age_s = math.inf if good_ns is None else (now_ns - good_ns) / NS_PER_S
         if age_s > stale_after_s:
             text = f"{channel} was last good {age_s:.1f} s ago, limit {stale_after_s} s"
             return (
-                Fault("sensor_bad", f"{channel} is BAD: {reading.reason}; {text}")
+                Fault(SENSOR_BAD, f"{channel} is BAD: {reading.reason}; {text}")
                 if is_bad
-                else Fault("sensor_stale", text)
+                else Fault(SENSOR_STALE, text)
             )
         return None
 
@@ -108,7 +137,7 @@ def disagreement(channel: str, other: str, max_K: float) -> Rule:
         value_degC, other_degC = value_of(readings, channel), value_of(readings, other)
         if abs(value_degC - other_degC) > max_K:
             text = f"{channel} {value_degC:.2f} degC and {other} {other_degC:.2f} degC differ by more than {max_K} K"
-            return Fault("sensors_disagree", text)
+            return Fault(SENSORS_DISAGREE, text)
         return None
 
     return rule
@@ -135,7 +164,7 @@ def stopped_while_permitted(running: str, permit: str) -> Rule:
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         if value_of(readings, running) == 0 and value_of(readings, permit) == 1:
-            return Fault("regulator_stopped", f"{running} is 0 though heating is permitted: stopped at the unit")
+            return Fault(REGULATOR_STOPPED, f"{running} is 0 though heating is permitted: stopped at the unit")
         return None
 
     return rule
@@ -146,7 +175,7 @@ def permit_missing(running: str, permit: str) -> Rule:
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         if value_of(readings, running) == 1 and value_of(readings, permit) == 0:
-            return Fault("permit_missing", f"{permit} is off though the regulator runs")
+            return Fault(PERMIT_MISSING, f"{permit} is off though the regulator runs")
         return None
 
     return rule
@@ -170,7 +199,7 @@ def settings_changed(channel: str) -> Rule:
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         reading = readings.known(channel)
         if reading is not None and reading.quality is Quality.GOOD and reading.reason:
-            return Fault("settings_changed", f"{channel.partition('.')[0]}: {reading.reason}")
+            return Fault(SETTINGS_CHANGED, f"{channel.partition('.')[0]}: {reading.reason}")
         return None
 
     return rule
@@ -187,7 +216,7 @@ def dewed(flap: str, channels: tuple[str, ...], lowest_degC: Callable[[Readings]
             value_degC = value_of(readings, channel)
             if value_degC < limit_degC:
                 limit = f"and water may settle below {limit_degC:.1f} degC"
-                return Fault("dew", f"{channel} is {value_degC:.2f} degC with the flap open, {limit}")
+                return Fault(DEW, f"{channel} is {value_degC:.2f} degC with the flap open, {limit}")
         return None
 
     return rule
@@ -197,7 +226,7 @@ def contact(channel: str, fault_when: float, text: str) -> Rule:
     """A contact of the stand reads `fault_when` (0 open, 1 closed)."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        return Fault("contact", text) if value_of(readings, channel) == fault_when else None
+        return Fault(CONTACT, text) if value_of(readings, channel) == fault_when else None
 
     return rule
 
@@ -208,7 +237,7 @@ def flap_open(position: str, is_excused: Callable[[], bool] = lambda: False) -> 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         openness = value_of(readings, position)
         if openness > _OPEN_ABOVE and not is_excused():
-            return Fault("flap_open", f"{position} is {openness:.2f}, open")
+            return Fault(FLAP_OPEN, f"{position} is {openness:.2f}, open")
         return None
 
     return rule
@@ -218,7 +247,7 @@ def paused(is_paused: Callable[[], bool]) -> Rule:
     """An operator's pause stands; how long it may is the watch's grace time."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        return Fault("paused_too_long", "an operator has paused the run and not continued it") if is_paused() else None
+        return Fault(PAUSED_TOO_LONG, "an operator has paused the run and not continued it") if is_paused() else None
 
     return rule
 
@@ -230,7 +259,7 @@ def camera_temperature_bad(channel: str, frames_to_come: Callable[[], bool]) -> 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         reading = readings.known(channel)
         if reading is not None and reading.quality is Quality.BAD and frames_to_come():
-            return Fault("camera_temperature_bad", f"{channel} is BAD: {reading.reason}")
+            return Fault(CAMERA_TEMPERATURE_BAD, f"{channel} is BAD: {reading.reason}")
         return None
 
     return rule
@@ -240,7 +269,7 @@ def frames_stopped(reason: Callable[[], str]) -> Rule:
     """The recorder takes no more frames; `reason()` says why, "" while it does."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        return Fault("disk_low", reason()) if reason() else None
+        return Fault(DISK_LOW, reason()) if reason() else None
 
     return rule
 
@@ -253,7 +282,7 @@ def intrusion(times: Callable[[], int]) -> Rule:
         if times() < 2:
             return None
         text = f"heat, cold or the regulator were switched on {times()} times without permission: by whom?"
-        return Fault("switched_on_without_permission", text)
+        return Fault(SWITCHED_ON_WITHOUT_PERMISSION, text)
 
     return rule
 
@@ -263,7 +292,7 @@ def heat_uncontrolled(why: Callable[[], str]) -> Rule:
     the relay in series is all that ends the heat then."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        return Fault("heat_uncontrolled", f"the heat does not obey: {why()}") if why() else None
+        return Fault(HEAT_UNCONTROLLED, f"the heat does not obey: {why()}") if why() else None
 
     return rule
 
@@ -296,7 +325,7 @@ def not_recorded(recording: Recording, durable_within_s: float) -> Rule:
             return None
         age_s = (now_ns - since_ns) / NS_PER_S
         text = f"what was measured {age_s:.0f} s ago is not on the disk yet, limit {durable_within_s:g} s"
-        return Fault(NOT_DURABLE, text)
+        return Fault(NOT_RECORDED, text)
 
     return rule
 
@@ -305,7 +334,7 @@ def folder_lost(recording: Recording) -> Rule:
     """The session's folder was removed or renamed while it is being recorded."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        return Fault("folder_lost", recording.folder_lost) if recording.folder_lost else None
+        return Fault(FOLDER_LOST, recording.folder_lost) if recording.folder_lost else None
 
     return rule
 

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from functools import partial
 
 from foundation.errors import DeviceAlarm, DeviceError, GarbledReply, Unreachable
+from foundation.events import guard_rule
 from foundation.items import Batch, Item
 from foundation.readings import Quality
 from stand.fault import Fault, Readings
 from stand.guarding.interlocks import DEVICE_FAULT, STAGE_ALARM, Watch
 
-DEVICE_LOST = "device_lost"
+DEVICE_LOST = guard_rule("device_lost", "a step met a device that does not answer")
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from foundation.clock import seconds_ns
+from foundation.events import guard_rule
 from stand.config.chamber_section import NeededOutputConfig
 from stand.fault import Fault, Readings, value_of
 from stand.guarding.heat_given import heat_percent
 from stand.guarding.interlocks import Rule
 from stand.guarding.plausibility import remembering
 
+OUTPUT_NOT_AS_NEEDED = guard_rule(
+    "output_not_as_needed", "the regulator needs another output than before for the same set-point"
+)
 _FLAP_OPEN_ABOVE = 0.05
 _LEARNING = 0.25  # share of a new mean; the first is taken whole
 
@@ -86,7 +90,7 @@ def _judged(needs: Needs, rest: Rest, limits: NeededOutputConfig, regulator: str
     state = replace(needs, sum_percent=0.0, count=0)
     if needed_percent is not None and abs(mean_percent - needed_percent) > limits.limit_percent:
         text = f"{regulator} heats by {mean_percent:.0f} % at {rest.set_point_degC:.1f} degC, where the chamber needed"
-        return state, Fault("output_not_as_needed", f"{text} {needed_percent:.0f} % before")
+        return state, Fault(OUTPUT_NOT_AS_NEEDED, f"{text} {needed_percent:.0f} % before")
     was_percent = needs.learned.get(rest)
     now_percent = mean_percent if was_percent is None else was_percent + _LEARNING * (mean_percent - was_percent)
     return replace(state, learned={**needs.learned, rest: now_percent}), None

@@ -12,12 +12,17 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.events import SENSOR, guard_rule
 from foundation.readings import Reading
 from stand.config.guard_section import CoolingConfig, HeaterOffConfig, HeatingConfig
 from stand.fault import Fault, Readings, in_doubt, value_of
 from stand.guarding.interlocks import Rule
 from stand.guarding.surroundings import Surroundings
 
+HEATER_NOT_WARMING = guard_rule("heater_not_warming", "heat is given and the air does not warm")
+WARMING_WHILE_OFF = guard_rule("warming_while_off", "the air warms though nothing heats")
+COOLING_IN_VAIN = guard_rule("cooling_in_vain", "cold is given and the air does not cool")
+SENSOR_STUCK = guard_rule("sensor_stuck", "a temperature stays exactly where it is while another moves", SENSOR)
 Memory = TypeVar("Memory")
 
 
@@ -108,7 +113,7 @@ def heater_not_warming(limits: HeatingConfig, regulator: str, permit: str) -> Ru
         if state is None or state.approaching or state.error_K_s < limits.max_error_K_s:
             return state, None
         text = f"{pv} {pv_degC:.1f} degC has not risen by {limits.gain_K} K in {limits.window_s:g} s of heating"
-        return state, Fault("heater_not_warming", f"{text} towards {state.set_point_degC:.1f} degC")
+        return state, Fault(HEATER_NOT_WARMING, f"{text} towards {state.set_point_degC:.1f} degC")
 
     return remembering(step)
 
@@ -154,7 +159,7 @@ def warming_while_off(
         state = Off(last.since_ns, channel, lowest_degC)
         if air_degC - lowest_degC >= limits.rise_K + scatters_K[channel] and is_heat(readings, air_degC, around_degC):
             text = f"{channel} has risen from {lowest_degC:.2f} to {air_degC:.2f} degC with the heater off"
-            return state, Fault("warming_while_off", text)
+            return state, Fault(WARMING_WHILE_OFF, text)
         return state, None
 
     return remembering(step)
@@ -194,7 +199,7 @@ def cooling_in_vain(
         text = (
             f"{air} stays at {air_degC:.2f} degC though the compressor has run for {limits.window_s:g} s without heat"
         )
-        return last, Fault("cooling_in_vain", text)
+        return last, Fault(COOLING_IN_VAIN, text)
 
     return remembering(step)
 
@@ -224,6 +229,6 @@ def stuck_while_other_moves(channel: str, other: str, moved_K: float, after_s: f
         went_K = abs(other_value - last.other)
         if now_ns - last.since_ns < seconds_ns(after_s) or not went_K >= moved_K + scatter_K:
             return last, None
-        return last, Fault("sensor_stuck", f"{channel} stays at {value} while {other} went by {went_K:.2f} K")
+        return last, Fault(SENSOR_STUCK, f"{channel} stays at {value} while {other} went by {went_K:.2f} K")
 
     return remembering(step)

@@ -15,6 +15,7 @@ from foundation.hub import Hub
 from foundation.instants import utc_text
 from foundation.items import Event, Item
 from foundation.progress import late_progress
+from foundation.repeats import RepeatLimit
 from foundation.tasks import cancelled, cause_of, failure_text
 from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
 from recording.writing.disk import REPAIR_LINE, Disk, DiskCalls
@@ -22,7 +23,6 @@ from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recor
 from recording.writing.recorder_settings import SessionInfo
 from stand.assembly import Assembly, assemble
 from stand.config.safe_ranges import accepted_text
-from stand.message_limit import stand_hub
 from stand.running.guest import Guest, Job
 from stand.running.opening.claim import claimed
 from stand.running.opening.clock_watch import ClockWatch
@@ -179,7 +179,7 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
     async with claimed(job.order.config, directory) if isinstance(clock, WallClock) else nullcontext():
         if isinstance(clock, WallClock):
             await asyncio.to_thread(_check_latch, job)
-        hub, early = stand_hub(), _Early()
+        hub, early = Hub(RepeatLimit()), _Early()
         job.watch(hub)
         hub.subscribe(early)
         if isinstance(clock, WallClock):

@@ -20,12 +20,13 @@ from typing import cast
 
 from foundation.clock import Clock, VirtualClock, boot_time_ns, seconds_ns
 from foundation.errors import ConfigError
+from foundation.events import RUN_FAILED, alert_of
 from foundation.helper import Helper
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.tasks import cancelled, cause_of, failure_text
 from stand.config.alerts_section import AlertsConfig, load_secrets
-from stand.serving.alert_book import RUN_FAILED, AlertBook, Message, sign_of
+from stand.serving.alert_book import AlertBook, Message
 from stand.serving.alerts_process import MISSING, MODULE, deliver, ping
 
 _LIMIT_S = 20.0  # for a receiver
@@ -105,7 +106,7 @@ class Alerts:
 
     def __call__(self, item: Item) -> None:
         """Take note of an event; returns at once."""
-        if isinstance(item, Event) and sign_of(item) is not None:
+        if isinstance(item, Event) and alert_of(item) is not None:
             self._events.put(item)
 
     async def beat(self, is_well: Callable[[], bool]) -> None:

@@ -3,8 +3,9 @@
 import pytest
 
 from foundation.clock import NS_PER_S
+from foundation.events import alert_of
 from foundation.items import Event
-from stand.serving.alert_book import AlertBook, sign_of
+from stand.serving.alert_book import AlertBook
 
 CAUSES = (
     "trip", "hold", "device_lost", "disk", "prompt", "run_started", "run_finished", "run_aborted", "queue_empty",
@@ -44,7 +45,7 @@ def reported(found, *events, until_s=0):
         ("device_back", {"device": "regulator"}, "device_lost", "over"),
         ("frames_stopped", {}, "disk", "lasting"),
         ("disk_nearly_full", {}, "disk", "raised"),
-        ("prompt", {}, "prompt", "raised"),
+        ("prompt", {"attended": True}, "prompt", "raised"),
         ("run.start", {}, "run_started", "raised"),
         ("run.end", {"status": "complete"}, "run_finished", "raised"),
         ("run.end", {"status": "tripped"}, "run_aborted", "raised"),
@@ -54,12 +55,12 @@ def reported(found, *events, until_s=0):
     ],
 )
 def test_what_an_event_means(kind, data, cause, phase):
-    sign = sign_of(event(kind, **data))
+    sign = alert_of(event(kind, **data))
     assert (cause, phase) == (None, None) if sign is None else (sign.cause, sign.phase) == (cause, phase)
 
 
 def test_a_prompt_that_nobody_is_there_for_is_not_reported():
-    assert sign_of(event("prompt", level="info")) is None
+    assert alert_of(event("prompt", level="info", attended=False)) is None
 
 
 def test_what_is_over_within_the_grace_time_is_not_reported():
@@ -114,11 +115,11 @@ def test_a_run_that_fails_before_it_begins_is_reported_and_one_that_ended_not_tw
 
 def test_in_an_hour_only_so_many_are_sent_but_every_trip():
     found = book(most_per_h=3, grace_ns=0)
-    prompts = [event("prompt", second, text=str(second)) for second in range(10)]
+    prompts = [event("prompt", second, text=str(second), attended=True) for second in range(10)]
     assert [text for _, text in reported(found, *prompts)] == ["0", "1", "2"]
     trip = event("guard.over_temperature", 20, action="abort")
     assert reported(found, trip) == [("TRIPPED", "why\n7 messages before this one were left out")]
-    assert [text for _, text in reported(found, event("prompt", 3700, text="later"))] == ["later"]
+    assert [text for _, text in reported(found, event("prompt", 3700, text="later", attended=True))] == ["later"]
 
 
 def test_only_what_is_wanted_is_reported():

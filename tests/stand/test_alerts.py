@@ -96,7 +96,7 @@ async def test_what_a_receiver_refused_is_sent_again_and_reported_once_without_i
     receiver.status = 503
     async with alerting("lab", config, hub, clock):
         hub.subscribe(seen.append)
-        publish(hub, clock, "prompt", text="close the door")
+        publish(hub, clock, "prompt", text="close the door", attended=True)
         await reached(lambda: sum(item.kind == "alert_failed" for item in seen) == 2)
         receiver.status = 200
         await reached(lambda: receiver.messages)
@@ -122,7 +122,7 @@ async def test_who_has_a_message_does_not_get_it_again_because_another_receiver_
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml", "json://127.0.0.1:9/closed"))
     hub, clock = Hub(), WallClock()
     async with alerting("lab", config, hub, clock):
-        publish(hub, clock, "prompt", text="close the door")
+        publish(hub, clock, "prompt", text="close the door", attended=True)
         await reached(lambda: len(tried) == 4)
     assert tried == [(), (2,), (2,), (2,)]
     assert len(receiver.messages) == 1

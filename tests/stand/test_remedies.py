@@ -1,113 +1,104 @@
-"""Each warning and error that the program publishes has a line that says what to type or to look at."""
+"""Each kind of event is a row of one table, from which the rest follows, also one that somebody else adds."""
 
 import ast
-from functools import cache
 from pathlib import Path
 
 import pytest
 
-import stand.watching.remedies as remedies
-from recording.format.restarts import KIND as RESTARTED
-from recording.format.utc_offsets import CLOCK_STEP
-from recording.reading.contents import PLAN_CHANGED, RUN_END
-from stand.imaging.equilibrium import LOST
-from stand.running.executing.camera_gap import CHANGED
-from stand.running.opening.clock_watch import HOST_SUSPENDED
-from stand.serving.alert_book import RUN_FAILED
-from stand.watching.remedies import next_command
+import stand
+from foundation.clock import NS_PER_S
+from foundation.events import GUARD, KINDS, Alert, EventKind, alert_of, event, guard_rule
+from foundation.hub import Hub
+from foundation.items import Event
+from foundation.repeats import RepeatLimit
+from stand.serving.alert_book import AlertBook
+from stand.watching.remedies import next_command, troubleshooting
+from stand.watching.there import event_line
 
-ROOT = Path(remedies.__file__).parents[2]
-ROOMS = ("stand", "recording", "drivers/devices", "foundation")
-LEVELS = ("warning", "error")
+ROOT = Path(stand.__file__).parents[1]
 GENERIC = next_command("of a later version", {})
 
-# Kinds that stand in a constant, or are handed over by who publishes them.
-NAMED = {
-    "CLOCK_STEP": CLOCK_STEP,
-    "HOST_SUSPENDED": HOST_SUSPENDED,
-    "KIND": RESTARTED,
-    "LOST": LOST,
-    "PLAN_CHANGED": PLAN_CHANGED,
-    "RUN_END": RUN_END,
-    "RUN_FAILED": RUN_FAILED,
-}
-HANDED_OVER = {
-    CHANGED,
-    PLAN_CHANGED,
-    RUN_END,
-    "compressor_dropped",
-    "compressor_not_on",
-    "heater_enable_dropped",
-    "heater_enable_not_on",
-    "interface_failed",
-    "left_on",
-    "permit_not_renewed",
-    "soak_restarted",
-    "switched_off",
-}
+
+@pytest.fixture
+def lamp():
+    """A kind that a package from outside brings."""
+    yield event(
+        "lamp.broken",
+        "warning",
+        "{lamp} has gone out after {lit_s:min} min: {said}",
+        "exchange {folder}'s lamp",
+        alert=Alert("device_lost", "lamp", "lasting"),
+        counts=True,
+    )
+    del KINDS["lamp.broken"]
 
 
-@cache
-def calls() -> tuple[ast.Call, ...]:
-    """Of the files that publish anything."""
-    paths = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
-    texts = [text for path in paths if any(f'"{each}"' in (text := path.read_text("utf-8")) for each in LEVELS)]
-    texts += [path.read_text("utf-8") for path in sorted((ROOT / "stand" / "guarding").glob("*.py"))]
-    return tuple(node for text in texts for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
+def published(*events: Event) -> list[Event]:
+    """What the hub of a stand lets through."""
+    hub, seen = Hub(RepeatLimit()), list[Event]()
+    hub.subscribe(lambda item: seen.append(item) if isinstance(item, Event) else None)
+    for each in events:
+        hub.publish(each)
+    return seen
 
 
-def published() -> set[str]:
-    """What follows a level among the arguments of a call of `Event`, `Notice` or something that tells."""
-    found: set[str] = set()
-    for call in calls():
-        name = ast.unparse(call.func).rpartition(".")[2]
-        if name not in ("Event", "Notice", "tell", "_tell", "_event"):
-            continue
-        for level, kind in zip(call.args, call.args[1:], strict=False):
-            levels = [level.body, level.orelse] if isinstance(level, ast.IfExp) else [level]
-            if not any(isinstance(each, ast.Constant) and each.value in LEVELS for each in levels):
-                continue
-            match kind:
-                case ast.Constant(str(value)):
-                    found.add(value)
-                case ast.Name(id=constant) if constant.isupper():
-                    found.add(NAMED[constant])
-                case _:
-                    pass  # one of HANDED_OVER, or a rule of the guard
-    return found
+def test_a_kind_that_is_added_is_found_everywhere(lamp: EventKind):
+    (seen,) = published(lamp.at(5 * NS_PER_S, "no current", lamp="lamp 2", lit_s=720.0))
+    said = "lamp 2 has gone out after 12 min: no current"
+    assert seen == Event(5 * NS_PER_S, "warning", "lamp.broken", said, {"lamp": "lamp 2", "lit_s": 720.0})
+    assert next_command(seen.kind, seen.data, "/a night") == "exchange '/a night''s lamp"
+    line = event_line({**vars_of(seen), "utc_offset_ns": 0}, "/n")
+    assert line.endswith(f"warning: {said}; exchange /n's lamp")
+    book = AlertBook("lab", ("device_lost",), 60 * NS_PER_S, 20)
+    assert book.receive(seen, seen.time_ns) == []
+    assert [each.text for each in book.due(65 * NS_PER_S)] == [said]
+    assert len(published(*[lamp.at(second, lamp="1", lit_s=1.0) for second in range(50)])) == 50
+    row = next(line for line in troubleshooting().splitlines() if "`lamp.broken`" in line)
+    assert [cell.strip() for cell in row.strip("|").split(" | ")[1:]] == [
+        "warning",
+        "{lamp} has gone out after {lit_s:min} min: {said}",
+        "exchange DIR's lamp",
+        "device_lost",
+    ]
 
 
-@cache
-def rules() -> set[str]:
-    """Names of the guard's."""
-    return {
-        str(call.args[0].value)
-        for call in calls()
-        if ast.unparse(call.func) == "Fault" and isinstance(call.args[0], ast.Constant)
-    }
+def vars_of(seen: Event) -> dict[str, object]:
+    return {"time_ns": seen.time_ns, "level": seen.level, "kind": seen.kind, "text": seen.text, "data": seen.data}
 
 
-KINDS = sorted(published() | HANDED_OVER)
+def test_a_rule_of_the_guard_that_is_added_has_its_row():
+    name = guard_rule("too_loud", "the fan is too loud", "oil it")
+    try:
+        kind = KINDS[GUARD + name]
+        trip, warning = (kind.at(0, "85 dB", rule=name, action=action) for action in ("abort", "warn"))
+        assert (trip.level, warning.level, trip.text) == ("error", "warning", "85 dB")
+        assert (alert_of(trip), alert_of(warning)) == (Alert("trip", "guard"), None)
+        assert next_command(warning.kind, warning.data) == "oil it"
+        assert "| `guard.too_loud` that only warns | warning | the fan is too loud | oil it |" in troubleshooting()
+    finally:
+        del KINDS[GUARD + name]
 
 
-def test_the_kinds_that_are_published_were_found():
-    assert {"device_lost", "frames_dropped", "pictures_lost", "prompt", CLOCK_STEP, RESTARTED} <= set(KINDS)
-    assert len(KINDS) > 70
+def test_a_name_is_taken_once():
+    with pytest.raises(ValueError, match="device_lost"):
+        event("device_lost", "info", "again")
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_each_kind_has_a_line_of_its_own(kind: str):
-    reported = next_command(kind, {"status": "stopped"}, "/data/a night")
-    assert reported != GENERIC
-    assert "{" not in reported
-    assert "DIR" not in reported
+@pytest.mark.parametrize("kind", [row for row in KINDS.values() if not row.startswith(GUARD)])
+def test_each_warning_and_error_has_advice_of_its_own(kind: EventKind):
+    for case in kind.cases:
+        if kind.level_of(case) != "info":
+            advice = next_command(kind, {"status": "stopped", **case}, "/data/a night")
+            assert advice != GENERIC
+            assert "{" not in advice
+            assert "DIR" not in advice
 
 
-@pytest.mark.parametrize("rule", remedies._OF_RULE)
-def test_rules_that_only_warn_have_theirs(rule: str):
-    assert rule in rules()
-    assert next_command(f"guard.{rule}", {"action": "warn"}) != GENERIC
-
-
-def test_no_line_is_of_a_kind_that_nobody_publishes():
-    assert set(remedies._OF_KIND) - set(KINDS) == set()
+def test_each_rule_that_trips_has_a_row():
+    named = [
+        call.args[0]
+        for path in sorted((ROOT / "stand").rglob("*.py"))
+        for call in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "Fault" and call.args
+    ]
+    assert [ast.unparse(each) for each in named if isinstance(each, ast.Constant)] == []

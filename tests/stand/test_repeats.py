@@ -5,11 +5,11 @@ import pytest
 from foundation.clock import seconds_ns
 from foundation.hub import Hub
 from foundation.items import Event
-from stand.message_limit import stand_hub
+from foundation.repeats import RepeatLimit
 
 
 def published(kind: str, every_s: float, count: int, data: dict[str, object] | None = None) -> list[Event]:
-    hub, events = stand_hub(), list[Event]()
+    hub, events = Hub(RepeatLimit()), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     for number in range(count):
         text = f"relays.heater_enable is off {number * 0.1:.1f} s before its time"
@@ -40,7 +40,7 @@ def test_what_begins_or_ends_a_state_is_always_published(kind: str, data: dict[s
 
 
 def test_another_sentence_or_an_information_is_not_withheld():
-    hub, events = stand_hub(), list[object]()
+    hub, events = Hub(RepeatLimit()), list[object]()
     hub.subscribe(events.append)
     for number in range(40):
         for name in ("air", "pv"):

@@ -28,6 +28,7 @@ def test_each_page_is_made(site: Path):
     pages = {path.name for path in site.glob("*.html")}
     assert {path.with_suffix(".html").name for path in (ROOT / "docs").glob("*.md")} <= pages
     assert {f"reference-{name}.html" for name in ("stand", "recipe", "registers", "target")} <= pages
+    assert "troubleshooting.html" in pages
 
 
 def test_no_page_loads_anything_from_elsewhere(site: Path):

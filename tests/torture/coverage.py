@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import inspect
-import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 
+from foundation.events import GUARD
 from stand.running.memory import entries
+from stand.watching.remedies import rows
 from tests.torture.case import KINDS, ORDERS
-from tests.torture.lives import ROOT
 from tests.torture.rig import Result
-
-_RULE = re.compile(r"\bFault\(\s*\"([a-z_]+)\"")
-_EVENT = re.compile(r"(?:Event|Notice)\([^\"]*\"(?:info|warning|error)\",\s*\"([a-z_.]+)\"")
 
 
 class Reached:
@@ -47,19 +43,13 @@ class Reached:
 
 
 def everything() -> Mapping[str, set[str]]:
-    """All that there is, as the sources name it."""
+    """All that there is, as the tables name it."""
     own = [
         each.__name__ for _, each in inspect.getmembers(entries, inspect.isclass) if each.__module__ == entries.__name__
     ]
     return {
         "kinds": {*KINDS, *ORDERS, "kill"},
-        "rules": set(_named(_RULE, ("stand",))),
-        "events": set(_named(_EVENT, ("stand", "recording"))),
+        "rules": {row.removeprefix(GUARD) for row in rows() if row.startswith(GUARD)},
+        "events": {row for row in rows() if not row.startswith(GUARD)},
         "entries": set(own),
     }
-
-
-def _named(pattern: re.Pattern[str], packages: Iterable[str]) -> Iterator[str]:
-    for package in packages:
-        for path in Path(ROOT / package).rglob("*.py"):
-            yield from pattern.findall(path.read_text(encoding="utf-8"))

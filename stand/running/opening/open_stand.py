@@ -13,8 +13,10 @@ from typing import Protocol, TypeVar
 
 from foundation.clock import VirtualClock, WallClock
 from foundation.errors import DeviceFault, StandError, Unreachable
+from foundation.hub import Hub
 from foundation.items import Event
 from foundation.patience import Patience
+from foundation.repeats import RepeatLimit
 from foundation.tasks import cancelled, watched
 from recording.writing.disk import FILES_LINE, LATCH_LINE, Disk
 from stand.assembly import Assembly, assemble
@@ -24,7 +26,6 @@ from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
 from stand.guarding.guard import Guard
 from stand.guarding.interlocks import Recording
 from stand.guarding.rules import Announcements
-from stand.message_limit import stand_hub
 from stand.poller import Poller
 from stand.running.opening.claim import claimed
 from stand.running.opening.holds import keep_shut_in_holds
@@ -358,7 +359,7 @@ async def at_bench(config: StandConfig, command: str) -> AsyncGenerator[Assembly
     """
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(claimed(config, None, command))
-        assembly = assemble(config, stand_hub(), WallClock())
+        assembly = assemble(config, Hub(RepeatLimit()), WallClock())
         stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
         stack.push_async_callback(close_devices, assembly)
         yield assembly
