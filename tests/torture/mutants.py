@@ -40,7 +40,9 @@ TABLE = Path(__file__).with_name("mutants.yaml")
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", ".hypothesis", ".*_cache")
 TORTURE = "tests/system/test_torture.py"
 MOST_LEFT = 0.05  # of those that are mistakes
-_LONGEST_S, _SLOWER, _AT_LEAST_S = 3600.0, 5.0, 60.0  # than without a mistake: beyond that it hangs
+# What takes so much more of the processor's time than without a mistake hangs; so does what waits, on a machine that
+# has as much to do for others.
+_LONGEST_S, _MORE, _AT_LEAST_S, _SLOWER = 900.0, 3.0, 10.0, 20.0
 _OURS = {path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()} | {"tests"}
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 _OTHER: dict[type, type] = {
@@ -123,11 +125,11 @@ class Copy:
         self._is_prepared = False
         self._env = {"PYTHONPATH": str(self.folder), WORKER: str(12 + number), "TMPDIR": str(folder)}
 
-    def found(self, names: str, limit_s: float) -> str:
-        """The first test of those files that fails here, "" for none."""
-        tests = multiprocessing.get_context("fork").Process(target=self._run, args=(names.split(),))
+    def found(self, names: str, processor_s: float) -> str:
+        """The first test of those files that fails here, "" for none; so much time of the processor is enough."""
+        tests = multiprocessing.get_context("fork").Process(target=self._run, args=(names.split(), round(processor_s)))
         tests.start()
-        tests.join(limit_s)
+        tests.join(_SLOWER * processor_s)
         if not self._is_prepared and self._modules.is_file():
             self._prepare()
         if tests.exitcode is None:
@@ -142,12 +144,12 @@ class Copy:
         return next(iter(_FAILED.findall(out)), f"{names.partition(' ')[0]} or after it ({tests.exitcode})")
 
     def with_mistake(self, made: Mutant, stages: list[tuple[str, float]]) -> str:
-        """What finds it of the stages (tests, and how long they may take), "" for nothing."""
+        """What finds it of the stages (tests, and how much of the processor's time is enough), "" for nothing."""
         path = self.folder / made.file
         right = path.read_bytes()
         path.write_text(made.source, encoding="utf-8")
         try:
-            return next((found for names, limit_s in stages if (found := self.found(names, limit_s))), "")
+            return next((found for names, most_s in stages if (found := self.found(names, most_s))), "")
         finally:
             path.write_bytes(right)
             shutil.rmtree(path.parent / "__pycache__", ignore_errors=True)
@@ -159,9 +161,10 @@ class Copy:
             with suppress(Exception):
                 importlib.import_module(name)
 
-    def _run(self, names: list[str]) -> None:
+    def _run(self, names: list[str], processor_s: int) -> None:
         """In a process of its own."""
         os.setsid()
+        resource.setrlimit(resource.RLIMIT_CPU, (processor_s, processor_s))
         os.chdir(self.folder)
         os.environ |= self._env
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -202,11 +205,17 @@ def _begin(folder: Path, numbers: SimpleQueue[int]) -> None:
 
 
 def _limited(names: str) -> tuple[str, float]:
-    """How long these tests may take; all must pass as it is."""
-    begun_s = time.monotonic()
+    """How much of the processor's time is enough for these tests; all must pass as it is."""
+    begun_s = _processor_s()
     if found := _here[0].found(names, _LONGEST_S):
         raise SystemExit(f"{found} fails without any mistake")
-    return names, _AT_LEAST_S + _SLOWER * (time.monotonic() - begun_s)
+    return names, _AT_LEAST_S + _MORE * (_processor_s() - begun_s)
+
+
+def _processor_s() -> float:
+    """Of what was started from here, and has ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _looked(made: Mutant, stages: list[tuple[str, float]]) -> str:
@@ -245,8 +254,7 @@ def main() -> int:
             minutes_left = (time.monotonic() - begun_s) / count * (len(made) - count) / 60.0
             sys.stdout.write(f"[{count}/{len(made)}, {minutes_left:.0f} min left] {each.file}:{each.line}: {said}\n")
             sys.stdout.flush()
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    minutes, processor_min = (time.monotonic() - begun_s) / 60.0, (used.ru_utime + used.ru_stime) / 60.0
+    minutes, processor_min = (time.monotonic() - begun_s) / 60.0, _processor_s() / 60.0
     counts = ", ".join(f"{number} {name}" for name, number in how.most_common())
     sys.stdout.write(
         f"{len(every)} drawn: {len(every) - len(made)} equivalent, {counts}; "
