@@ -7,6 +7,7 @@ import itertools
 import math
 import multiprocessing
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -82,8 +83,9 @@ def _report(results: Iterator[Result], left: Callable[[int, float], float], trie
         first, *more = told(result)
         say("\n".join([f"{first}    [{count} cases, {minutes_left:.0f} min left]", *more]))
         if result.violations and tries:
-            least = shrunk(result.case, result.broken, tries)
-            say(f"python -m tests.torture {result.case.seed}    shrunk to:\n{write_case(least)}")
+            least = write_case(shrunk(result.case, result.broken, tries))
+            (path := Path(tempfile.gettempdir()) / f"torture-{result.case.seed}.yaml").write_text(least)
+            say(f"python -m tests.torture --case {path}    what is left of it:\n{least}")
     minutes = (time.monotonic() - begun_s) / 60.0
     say(f"{count} cases, {broken} broken; {simulated_s / 3600.0:.1f} simulated hours in {minutes:.1f} min")
     say("\n".join(reached.told()))

@@ -76,8 +76,14 @@ def steps_of(plan: dict[str, list[Any]]) -> int:
 
 
 def write_case(case: Case) -> str:
-    """As YAML."""
-    return yaml.safe_dump(json.loads(json.dumps(asdict(case))), sort_keys=False, width=120)
+    """As YAML, without what is as usual; a line for each fault and order."""
+    usual = asdict(Case(case.seed, case.stand, case.plan))
+    data = {name: value for name, value in asdict(case).items() if name in ("stand", "plan") or value != usual[name]}
+    data = {"seed": case.seed, **json.loads(json.dumps(data))}
+    for order in data.get("orders", ()):
+        if not order["body"]:
+            del order["body"]
+    return yaml.safe_dump(data, sort_keys=False, width=140, default_flow_style=None)
 
 
 def read_case(path: Path) -> Case:
@@ -274,28 +280,35 @@ def stand_document(case: Case, folder: Path) -> dict[str, Any]:
     return data
 
 
-def smaller(case: Case) -> Iterator[Case]:
-    """What a failing case could be instead, the boldest first."""
-    for name in ("faults", "orders", "kills_s"):
+_PLAINER = {"drawn_order": False, "chamber_seed": None, "attended": False, "laboratory_degC": 24.0}
+
+
+def smaller(case: Case) -> Iterator[tuple[str, Case]]:
+    """What a failing case could be instead, the boldest first; of each what is left out or plainer, in words that are
+    the same for a case that has become smaller elsewhere."""
+    yield "nothing happens", replace(case, faults=(), orders=(), kills_s=())
+    for name in ("kills_s", "orders", "faults"):
         whole: tuple[Any, ...] = getattr(case, name)
+        if whole:
+            yield f"no {name}", replace(case, **{name: ()})
         half = len(whole) // 2
-        parts = [(), whole[:half], whole[half:]] if half else [()] if whole else []
-        for part in parts:
-            yield replace(case, **{name: part})
-        for number in range(len(whole) if half else 0):
-            yield replace(case, **{name: (*whole[:number], *whole[number + 1 :])})
-    for name, plain in (("drawn_order", False), ("chamber_seed", None), ("attended", False), ("laboratory_degC", 24.0)):
-        if getattr(case, name) != plain:
-            yield replace(case, **{name: plain})
+        for part in (whole[:half], whole[half:]) if half > 1 else ():
+            yield f"without {part}", replace(case, **{name: tuple(each for each in whole if each not in part)})
+        for each in whole if len(whole) > 1 else ():
+            yield f"without {each}", replace(case, **{name: tuple(other for other in whole if other != each)})
+    yield "as usual", replace(case, **_PLAINER)
+    yield "a plain stand", replace(case, stand=PLAIN)
+    for plan in _shorter(case.plan.get("steps", [])):
+        yield f"the plan {plan}", replace(case, plan=plan)
     for place, choice in case.stand.items():
         if choice != PLAIN[place]:
-            yield replace(case, stand={**case.stand, place: PLAIN[place]})
-    for plan in _shorter(case.plan.get("steps", [])):
-        yield replace(case, plan=plan)
+            yield f"plain {place}", replace(case, stand={**case.stand, place: PLAIN[place]})
+    for name, plain in _PLAINER.items():
+        yield f"{name} as usual", replace(case, **{name: plain})
     for number, fault in enumerate(case.faults):
-        if fault.for_s > 5.0:
-            shorter = replace(fault, for_s=round(fault.for_s / 2, 1))
-            yield replace(case, faults=(*case.faults[:number], shorter, *case.faults[number + 1 :]))
+        if fault.for_s > 20.0:
+            shorter = replace(fault, for_s=round(fault.for_s / 4, 1))
+            yield f"shorter {fault}", replace(case, faults=(*case.faults[:number], shorter, *case.faults[number + 1 :]))
 
 
 def _shorter(steps: list[Any]) -> Iterable[dict[str, list[Any]]]:

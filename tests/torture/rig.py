@@ -76,13 +76,23 @@ def perform_seed(seed: int) -> Result:
 
 
 def shrunk(case: Case, rules: set[str], tries: int) -> Case:
-    """The smallest found that still breaks one of the rules; each try is a run."""
-    untried = smaller(case)
-    for _ in range(tries):
-        if (other := next(untried, None)) is None:
+    """The smallest found that still breaks one of the rules; each try is a run. What did not break it is tried again
+    only when everything else was tried: most of what a case needs it goes on to need."""
+    needed, again = set[str](), False
+    while tries:
+        for what, other in smaller(case):
+            if what in needed or other == case:
+                continue
+            tries -= 1
+            if perform(other).broken & rules:
+                case, again = other, True
+            else:
+                needed.add(what)
             break
-        if perform(other).broken & rules:
-            case, untried = other, smaller(other)
+        else:
+            if not again:
+                break
+            needed, again = set[str](), False
     return case
 
 

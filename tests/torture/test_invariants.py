@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.system.conftest import require_aravis
-from tests.torture.case import MOST_FAULTS, PLAIN, Case, Fault, Order, draw, read_case, smaller, steps_of, write_case
+from tests.torture.case import MOST_FAULTS, PLAIN, Case, Fault, Order, draw, read_case, steps_of, write_case
 from tests.torture.evidence import Evidence, Said
 from tests.torture.invariants import INVARIANTS, RELAYS_UNIT, violations
 from tests.torture.lives import live
@@ -137,19 +137,40 @@ def test_a_seed_draws_the_same_case_and_a_case_is_read_as_it_was_written(tmp_pat
         assert read_case(path) == case
 
 
-def test_a_broken_case_is_shrunk_to_what_breaks_it(monkeypatch: pytest.MonkeyPatch):
-    """The search alone: a case counts as broken while it has this fault and a camera."""
+@pytest.mark.parametrize(
+    ("needed", "tries"), [(("flap.jam",), 25), (("flap.jam", "pause"), 40), (("bus.cut", "camera.deaf", 9.0), 40)]
+)
+def test_a_broken_case_is_shrunk_to_what_breaks_it(
+    monkeypatch: pytest.MonkeyPatch, needed: tuple[object, ...], tries: int
+):
+    """The search alone: a case counts as broken while it has these faults, orders and kills, and two cameras."""
     from tests.torture import rig
 
     def is_broken(case: Case) -> set[str]:
-        return {"x"} if any(fault.name == "flap.jam" for fault in case.faults) else set[str]()
+        has = {*(fault.name for fault in case.faults), *(order.verb for order in case.orders), *case.kills_s}
+        return {"x"} if has >= set(needed) and case.stand["cameras"] == "2 cameras" else set[str]()
 
-    faults = tuple(Fault(name, True, 5.0, 60.0) for name in ("bus.cut", "flap.jam", "flap.stall", "camera.deaf"))
-    case = replace(draw(3), faults=faults, orders=(Order("pause", 3.0),), kills_s=(9.0,))
+    names = (
+        "bus.cut",
+        "flap.jam",
+        "flap.stall",
+        "camera.deaf",
+        "bus.noise",
+        "flap.mute",
+        "axis.alarm",
+        "relays.silent",
+    )
+    faults = tuple(Fault(name, True, 5.0, 1800.0) for name in names)
+    orders = tuple(Order(verb, 3.0) for verb in ("pause", "continue", "stop", "clear", "note", "state"))
+    case = replace(draw(3), faults=faults, orders=orders, kills_s=(9.0, 11.0, 12.0), attended=True)
+    case = replace(case, stand={**case.stand, "cameras": "2 cameras", "heat": "cts"})
     monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter(), Counter()))
     monkeypatch.setattr(rig.Result, "broken", property(lambda self: is_broken(self.case)))
-    least = shrunk(case, {"x"}, 200)
-    assert [fault.name for fault in least.faults] == ["flap.jam"]
-    assert (least.orders, least.kills_s, least.drawn_order) == ((), (), False)
-    assert steps_of(least.plan) < steps_of(case.plan)
-    assert len(list(smaller(least))) <= steps_of(least.plan) + 8
+    least = shrunk(case, {"x"}, tries)
+    assert {fault.name for fault in least.faults} == {name for name in names if name in needed}
+    assert [order.verb for order in least.orders] == [name for name in needed if name == "pause"]
+    assert least.kills_s == tuple(each for each in needed if isinstance(each, float))
+    done = shrunk(least, {"x"}, 1000)
+    assert done.stand == PLAIN | {"cameras": "2 cameras"}
+    assert (done.attended, done.drawn_order, steps_of(done.plan)) == (False, False, 2)
+    assert all(fault.for_s <= 20.0 for fault in done.faults)
