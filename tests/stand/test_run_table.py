@@ -348,6 +348,14 @@ def test_deadlines_are_a_grid_of_which_those_missed_are_skipped():
     assert due_after_ns(20 * S, FIT, 47 * S) == 40 * S  # the latest that has passed
 
 
+def test_a_frame_is_asked_for_its_lead_before_it_is_due():
+    state = fold(PLAN, STATES["next is ahead"])
+    for now_s, lead_s, expected in ((20, 0, Sleep(30 * S)), (20, 2, Sleep(28 * S)), (27, 2, Sleep(28 * S))):
+        assert next_action(state, Surroundings(now_s * S, lead_s * S, flap_open=True)) == expected
+    for now_s, lead_s in ((28, 2), (30, 0)):
+        assert isinstance(next_action(state, Surroundings(now_s * S, lead_s * S, flap_open=True)), TakeFrame)
+
+
 def test_an_outage_is_what_was_held_or_made_ready_since_the_last_frame_and_counts_once():
     entries = [
         *begun(CAPTURE),
