@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 
@@ -11,11 +11,18 @@ from stand.fault import Fault
 from stand.guarding.interlocks import (
     Rule,
     Watch,
+    camera_temperature_bad,
+    contact,
     disagreement,
     flap_open,
+    folder_lost,
     frames_stopped,
+    heat_uncontrolled,
+    intrusion,
+    not_recorded,
     over_temperature,
     permit_missing,
+    recording_ended,
     reported_fault,
     settings_changed,
     stage_alarm,
@@ -253,3 +260,50 @@ def test_a_watch_waits_until_its_rule_has_objected_without_a_break_for_its_grace
 
 def test_a_watch_without_grace_objects_at_once():
     assert Watch(objecting({0})).check(Hub(), 0) == Fault("rule", "it is so", "abort")
+
+
+@dataclass
+class Recorder:
+    waiting_since_ns: int | None = None
+    folder_lost: str = ""
+    writer_ended: str = ""
+
+
+def test_what_is_not_recorded_in_time_or_cannot_be_any_more_is_a_fault():
+    readings, recorder = Hub(), Recorder()
+    late, moved, ended = not_recorded(recorder, 10.0), folder_lost(recorder), recording_ended(recorder)
+    assert [rule(readings, seconds_ns(100)) for rule in (late, moved, ended)] == [None] * 3
+    recorder.waiting_since_ns = seconds_ns(90)
+    assert late(readings, seconds_ns(100)) is None
+    fault = late(readings, seconds_ns(102))
+    assert rule_of(fault) == "not_recorded"
+    assert fault is not None
+    assert "12 s ago" in fault.text
+    recorder.folder_lost, recorder.writer_ended = "it was renamed", "it was killed"
+    assert [rule_of(rule(readings, 0)) for rule in (moved, ended)] == ["folder_lost", "recording_ended"]
+
+
+def test_heat_that_others_switch_on_twice_and_heat_that_does_not_obey_are_faults():
+    for times, rule in ((0, None), (1, None), (2, "switched_on_without_permission")):
+        assert rule_of(intrusion(lambda times=times: times)(Hub(), 0)) == rule
+    assert heat_uncontrolled(lambda: "")(Hub(), 0) is None
+    assert rule_of(heat_uncontrolled(lambda: "it reads back 30 %")(Hub(), 0)) == "heat_uncontrolled"
+
+
+def test_a_cameras_temperature_that_is_lost_is_a_fault_while_frames_are_to_come():
+    channel = "camera.temperature"
+    good, bad = Reading(channel, 40.0, "degC", 0), bad_reading(channel, "degC", 0, "no answer")
+    for found, to_come, rule in (
+        (bad, True, "camera_temperature_bad"),
+        (bad, False, None),
+        (good, True, None),
+        (None, True, None),
+    ):
+        asked = camera_temperature_bad(channel, lambda to_come=to_come: to_come)
+        assert rule_of(asked(hub_of(found) if found else Hub(), 0)) == rule
+
+
+@pytest.mark.parametrize(("value", "trips"), [(1.0, True), (0.0, False), (math.nan, False), (None, False)])
+def test_a_contact_is_a_fault_in_the_state_that_is_one(value: float | None, trips: bool):
+    hub = Hub() if value is None else hub_with(inputs_door=value)
+    assert (contact("inputs.door", 1.0, "the door is open")(hub, 0) is not None) is trips

@@ -52,7 +52,7 @@ class Board:
 
     async def hold_on(self, channel: str, duration_s: float) -> None:
         if not self.is_jammed:
-            self.until_ns[channel] = self._clock.now_ns() + seconds_ns(duration_s)
+            self.until_ns[channel] = self._clock.now_ns() + duration_s * 1e9
         if self.failure is not None:
             raise self.failure
 
@@ -199,7 +199,7 @@ async def test_a_start_that_is_not_confirmed_counts_and_a_relay_that_then_drops_
         await bench.keep(5.0)
 
         async def fails_for_the_compressor(channel: str, duration_s: float) -> None:
-            bench.board.until_ns[channel] = bench.now_ns + seconds_ns(duration_s)
+            bench.board.until_ns[channel] = bench.now_ns + duration_s * 1e9
             if channel == COMPRESSOR:
                 raise Unreachable("relays", "its answer was lost")
 
@@ -316,6 +316,26 @@ async def test_a_board_that_drops_in_time_is_suited_and_its_time_is_measured_whe
             assert held_s == round(held_s, 2)
         assert bench.board.switched == [(HEATER, False)]
         assert bench.now_ns - begin_ns == seconds_ns(6.5)
+
+
+@pytest.mark.parametrize(("lasts", "rearmed", "dropped"), [(True, True, False), (False, False, True)])
+async def test_a_board_that_never_drops_or_does_not_begin_its_time_again_is_said_and_not_trusted(
+    lasts: bool, rearmed: bool, dropped: bool
+):
+    async with benches() as bench:
+        hold_on = bench.board.hold_on
+
+        async def held(channel: str, duration_s: float) -> None:
+            if not bench.board.is_on(channel):
+                await hold_on(channel, math.inf if lasts else duration_s)
+
+        bench.board.hold_on = held
+        with pytest.raises(DeviceFault, match="is not suited"):
+            await bench.permits.test_dead_man()
+        (found,) = bench.events
+        assert (found.level, found.kind) == ("error", "dead_man_tested")
+        assert (found.data["rearmed"], found.data["dropped"]) == (rearmed, dropped)
+        assert not bench.board.is_on(HEATER)
 
 
 async def test_a_computer_that_is_held_up_in_each_test_of_the_timer_says_so_and_trusts_no_board():

@@ -356,6 +356,13 @@ def test_a_frame_is_asked_for_its_lead_before_it_is_due():
         assert isinstance(next_action(state, Surroundings(now_s * S, lead_s * S, flap_open=True)), TakeFrame)
 
 
+def test_a_step_that_is_left_out_ends_what_is_under_way_only_when_that_is_it():
+    state = fold(PLAN, [*STATES["next is ahead"], Skipped(0, WARM)])
+    assert (state.under_way, state.due_ns) == (CAPTURE, 30 * S)
+    state = after(state, Skipped(0, CAPTURE))
+    assert (state.under_way, state.due_ns, state.plan[state.index]) == ("", None, PLAN[6])
+
+
 def test_an_outage_is_what_was_held_or_made_ready_since_the_last_frame_and_counts_once():
     entries = [
         *begun(CAPTURE),
