@@ -47,6 +47,7 @@ class Imaging:
         self._moving_flap = asyncio.Lock()  # one command after the other; making safe waits for none
         self.doubt_of: Callable[[str, float, int], str] = lambda channel, value, time_ns: ""  # of a temperature
         self._without_camera_ns = 0  # how long a lost camera was waited for since its last frame
+        self._exposed_ns = 0  # when the last exposure ended
 
     @property
     def flap_open(self) -> bool:
@@ -99,8 +100,13 @@ class Imaging:
         return None
 
     async def _grab(self, exposure_s: float, due_ns: int = 0, names: Collection[str] = ()) -> tuple[Frame, ...]:
+        """In virtual time a grab takes none: what exposes is not exposed again meanwhile."""
+        if self._clock.now_ns() < self._exposed_ns:
+            await self._clock.sleep_until(self._exposed_ns)
         cameras = [camera for name, camera in self._cameras.items() if not names or name in names]
-        return await grab_together(cameras, self._clock, exposure_s, due_ns)
+        frames = await grab_together(cameras, self._clock, exposure_s, due_ns)
+        self._exposed_ns = max((frame.time_ns + seconds_ns(frame.exposure_s / 2) for frame in frames), default=0)
+        return frames
 
     def _publish(self, frames: Iterable[Frame], step_id: str, flags: tuple[str, ...] = ()) -> dict[str, Frame]:
         """By channel."""

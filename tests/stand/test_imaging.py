@@ -44,6 +44,16 @@ async def test_of_two_cameras_those_that_are_named_expose_and_no_other():
         assert [frame.channel for frame in here.frames] == ["side.image", "camera.image", "side.image"]
 
 
+async def test_of_two_captures_one_after_the_other_each_is_exposed_at_an_instant_of_its_own():
+    """A frame is found again by its instant."""
+    async with rooms() as here:
+        await with_camera(here)
+        assert await here.stand.imaging.take_frame(8.0, "capture-1")
+        assert await here.stand.imaging.take_frame(8.0, "capture-2")
+        first, second = (frame.time_ns for frame in here.frames)
+        assert second - first >= 4_000_000_000
+
+
 async def test_a_lost_camera_holds_the_gate_until_it_is_open_and_gives_no_frame():
     async with rooms() as here:
         await with_camera(here)

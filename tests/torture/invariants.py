@@ -24,6 +24,7 @@ LEGS: dict[str, Leg] = {}
 MAX_AIR_DEGC, ABOVE_K = 65.0, 3.0
 FLAP_SHUT_S = 60.0
 BAND_K = 1.0  # of a soak
+EXPOSED_S = 0.5  # a frame's instant is the middle of its exposure, which begins when it is taken
 DURABLE_S = 15.0  # what is younger may be lost by a kill
 LONGEST_GAP_S, PROBED_S = 30.0, 60.0  # between readings; of how long a device is not asked that was lost
 MOST_AN_HOUR = 6
@@ -234,7 +235,7 @@ def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
             yield f"{topic} has the frame at {evidence.at_s(time_ns)} s {count} times"
     for row in (row for doors in evidence.doors for row in doors):
         run = row["answer"].get("run") if isinstance(row["answer"], dict) else None
-        there = sum(time_ns <= row["time_ns"] for _, time_ns in evidence.frames)
+        there = sum(time_ns <= row["time_ns"] + EXPOSED_S * 1e9 for _, time_ns in evidence.frames)
         if run and run["frames_saved"] > there:
             at_s = evidence.at_s(row["time_ns"])
             yield f"{run['frames_saved']} frames were saved at {at_s} s, of which {there} are there"

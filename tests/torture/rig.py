@@ -40,7 +40,9 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
     bytes again."""
     place = folder or Path(tempfile.mkdtemp(prefix="torture-"))
     try:
-        evidence = Evidence(case, place, live(case, place))
+        lives = live(case, place)
+        left = _digests(place)  # before the evidence, for which what is unfinished is salvaged
+        evidence = Evidence(case, place, lives)
         spans_ns = [int(each["time_ns"][-1] - each["time_ns"][0]) for each in evidence.truth if len(each)]
         events = Counter(said.kind for said in evidence.said)
         trips = [said for said in evidence.said if said.kind.startswith("guard.") and "rule" in said.data]
@@ -48,15 +50,14 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
         entries = Counter(str(each["entry"]) for each in evidence.journal)
         found = tuple(violations(evidence))
         if twice and not case.kills_s and all(life.status is not None for life in evidence.lives):
-            found += tuple(_differing(case, place))
+            found += tuple(_differing(case, place, left))
         return Result(case, tuple(evidence.lives), found, sum(spans_ns) / 1e9, events, rules, entries)
     finally:
         if folder is None:
             shutil.rmtree(place, ignore_errors=True)
 
 
-def _differing(case: Case, folder: Path) -> Iterator[Violation]:
-    first = _digests(folder)
+def _differing(case: Case, folder: Path, first: dict[str, str]) -> Iterator[Violation]:
     live(case, folder)
     second = _digests(folder)
     differing = sorted(name for name in first.keys() | second.keys() if first.get(name) != second.get(name))
