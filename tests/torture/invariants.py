@@ -366,13 +366,27 @@ def is_completed_in_the_end(evidence: Evidence) -> Iterator[str]:
         yield f"not complete after {len(evidence.lives)} lives: {last.err.strip()[-400:]}"
 
 
+@invariant(Leg.VIRTUAL)
+def is_told_what_to_mend(evidence: Evidence) -> Iterator[str]:
+    """Who resumes mends what he was told: nothing ends a run a third time with the same words."""
+    ends = (life.err.strip().splitlines() for life in evidence.lives if life.status in (1, 4))
+    said = Counter(_without_numbers(lines[-1]) for lines in ends if lines)
+    for words, count in said.items():
+        if count > 2:
+            yield f"{count} lives ended with: {words[:300]}"
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"[\d.]+", "#", text)
+
+
 @invariant(Leg.BOTH)
 def nobody_is_pestered(evidence: Evidence) -> Iterator[str]:
     """No warning or error more than six times an hour."""
     times: dict[tuple[str, str], list[int]] = {}
     for said in evidence.said:
         if said.level != "info":
-            times.setdefault((said.kind, re.sub(r"[\d.]+", "#", said.text)), []).append(said.time_ns)
+            times.setdefault((said.kind, _without_numbers(said.text)), []).append(said.time_ns)
     for (kind, text), when in times.items():
         spans = [last - first for first, last in zip(when, when[MOST_AN_HOUR:], strict=False)]
         if spans and min(spans) < 3600e9:

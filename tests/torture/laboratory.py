@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import struct
 import sys
@@ -23,7 +24,7 @@ from foundation.clock import seconds_ns
 from foundation.documents import parse_document
 from foundation.ending import Ending
 from foundation.errors import ConfigError
-from tests.torture.case import Case, read_case
+from tests.torture.case import Case, Fault, read_case
 
 FOLDER, LIFE = "TORTURE_FOLDER", "TORTURE_LIFE"
 AFTER_S = 90.0
@@ -33,6 +34,8 @@ TRUTH = (
     *("bulk_air_degC", "air_degC", "chamber_degC", "granite_inside_degC", "granite_outside_degC", "artifact_degC"),
     *("laboratory_degC", "body_degC", "sensor_degC"),
 )
+_NAMED = {"axis": "linear|rotary", "chamber": "chamber|regulator", "inputs": "inputs|door", "heater": "heat"}
+"""What the program calls a device that has another name here."""
 ROW = struct.Struct(f"<q{len(TRUTH)}d")
 
 
@@ -83,9 +86,9 @@ class Breaking(FaultSchedule):
             super()._set(name, value)
 
 
-def planned(case: Case, now_ns: int, life: int) -> list[PlannedFault]:
-    """What is still to come of the case's faults, or stands, seen from now. Who has resumed a run so often has mended
-    everything."""
+def planned(case: Case, now_ns: int, life: int, told: str) -> list[PlannedFault]:
+    """What is still to come of the case's faults, or stands, seen from now. An operator who has resumed in vain mends
+    what he was told, of what stands; in the end everything."""
     if life >= MENDED_AT_LIFE:
         return []
     now_s = (now_ns - case.start_ns) / 1e9
@@ -93,7 +96,14 @@ def planned(case: Case, now_ns: int, life: int) -> list[PlannedFault]:
     return [
         PlannedFault(each.name, each.value, max(0.0, each.at_s - now_s), each.for_s - max(0.0, now_s - each.at_s))
         for each in left
+        if each.at_s > now_s or not is_named(each, told)
     ]
+
+
+def is_named(fault: Fault, told: str) -> bool:
+    """Whether these words name the fault's device."""
+    device = fault.name.partition(".")[0]
+    return re.search(rf"\b(?:{_NAMED.get(device, device)})", told) is not None
 
 
 def main() -> int:
@@ -103,7 +113,8 @@ def main() -> int:
     life, case = int(os.environ[LIFE]), read_case(folder / "case.yaml")
     (begun := folder / f"begun-{life}").touch()
     laboratory = ObservedLaboratory(spec, folder, life)
-    schedule = Breaking(laboratory, planned(case, laboratory.now_ns, life))
+    told = "".join((folder / f"said-{number}.txt").read_text() for number in range(1, life))
+    schedule = Breaking(laboratory, planned(case, laboratory.now_ns, life, told))
     control = serve_control(laboratory, schedule, ending.ask)
     print(json.dumps({**laboratory.addresses, "control": control.address}), flush=True)  # noqa: T201 - as drivers.sim
     while not ending.wait(0.1) and os.getppid() == parent:

@@ -76,6 +76,10 @@ def end(evidence: Evidence, status: int | None) -> None:
     evidence.lives = [*evidence.lives[:-1], replace(evidence.lives[-1], status=status)]
 
 
+def fail_thrice(evidence: Evidence) -> None:
+    evidence.lives = [replace(evidence.lives[0], status=1, err=f"error: a cable is {n} m long\n") for n in range(3)]
+
+
 def pester(evidence: Evidence) -> None:
     evidence.said += [Said(number, "warning", "some", f"{number} K", {}) for number in range(8)]
 
@@ -109,6 +113,7 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "verify_finds_what_is_lost_and_nothing_else": lambda evidence: evidence.frames.popitem(),
     "ends_as_documented": lambda evidence: end(evidence, 77),
     "is_completed_in_the_end": lambda evidence: end(evidence, 1),
+    "is_told_what_to_mend": fail_thrice,
     "nobody_is_pestered": pester,
 }
 """For each invariant what is changed in the evidence, so that it must be found."""
