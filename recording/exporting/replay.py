@@ -26,7 +26,6 @@ from recording.exporting.topics import recorded_devices
 from recording.format.decoded_items import Description
 from recording.format.holes import holes_text
 from recording.format.images import IMAGE_CLASS, ImageEncoding
-from recording.format.layout import FORMAT
 from recording.format.records import frame_places
 from recording.reading.journal_lines import JOURNAL_NAME
 from recording.reading.session import Session
@@ -123,7 +122,7 @@ async def replay_and_record(
     settings = _settings(session, VIRTUAL_COMMIT_S if speed is None else speed)
     info = SessionInfo.of(session.metadata)
     if session.holes:
-        info = replace(info, format=str(FORMAT), holes=holes_text(session.holes))
+        info = replace(info, holes=holes_text(session.holes))
     with new_folder(out) as folder:
         devices = recorded_devices(session)
         recorder = Recorder(folder, info, session.attachments, devices, hub, clock, settings)

@@ -22,7 +22,7 @@ from recording.exporting.topics import recorded_topics
 from recording.format import messages
 from recording.format.holes import holes_text
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
-from recording.format.layout import FORMAT, FRAMES, TELEMETRY
+from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
 from recording.format.utc_offsets import offset_event
 from recording.reading.extent import Extent, extent_of
@@ -71,7 +71,7 @@ def _metadata(session: Session, begin_ns: int, end_ns: int) -> dict[str, str]:
         begin_ns, end_ns = max(begin_ns, before.begin_ns), min(end_ns, before.end_ns)
     extent = Extent(session.metadata.get("session_id", session.path.name), begin_ns, end_ns, session.run)
     holes = [part for hole in session.holes if (part := hole.within(begin_ns, end_ns)) is not None]
-    extra = {"format": str(FORMAT), "extent": extent.record(), "holes": holes_text(holes)}
+    extra = {"extent": extent.record(), "holes": holes_text(holes)}
     return {**session.metadata, **{name: text for name, text in extra.items() if text}}
 
 

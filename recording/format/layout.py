@@ -17,18 +17,22 @@ SALVAGE_METADATA = "salvage"  # of a segment that a salvage has made
 DEVICES = "devices"  # key of a channel's metadata: the names of the devices on its topic, with commas between
 SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; FrameMeta has all 64
 SESSION_CRC = "session_crc32"
-# Of the files, in the record `session`. 2 (2026-11-22): the record says so; events have data; how the run ended is in
-# that of `run.end`, how long its plan is in that of `run.start` and `run.resume`; a copy says of what extent it is and
-# which holes it has. Sessions of format 1 say nothing of all that and are read as before.
+# Of the files, in the record `session`. From 0.2.0 on formats are kept: each version of the program reads those of all
+# before it. What earlier, unreleased versions recorded is not read.
 FORMAT = 2
 _FORMAT_DIGITS = 4
 
 
-def later_format(session: Mapping[str, str]) -> str:
-    """What is wrong with the format that the record `session` states, in words; "" for one that this version knows."""
-    text = session.get("format", "1")
-    if text.isdecimal() and len(text) <= _FORMAT_DIGITS and int(text) <= FORMAT:
+def unknown_format(session: Mapping[str, str]) -> str:
+    """What is wrong with the format that the record `session` states, in words; "" for one that this version knows, and
+    for a record that is not there."""
+    text = session.get("format", "")
+    if not session or text == str(FORMAT):
         return ""
+    if not text or (text.isdecimal() and len(text) <= _FORMAT_DIGITS and int(text) < FORMAT):
+        return (
+            "was recorded by an earlier, unreleased version of thermostand; read it with that version, or record anew"
+        )
     return f"is of format {text[:20]!r}; this version of thermostand reads up to {FORMAT}"
 
 

@@ -36,7 +36,6 @@ from foundation.errors import SessionError
 from foundation.items import Batch, Event, Original, StepMark, StepState
 from foundation.readings import Cause, Frame, Quality, Reading
 from recording.format.kinds import KIND_OF_TOPIC, KINDS, Kind
-from recording.format.old_sentences import data_of_sentence
 
 CAMERA_META = "/camera/meta"
 TABLE_POSE = "/table/pose"
@@ -171,7 +170,7 @@ def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Batch:
 
 
 def _remarked(remark: Any) -> Reading:
-    cause = CAUSES.get(remark.cause, "")  # none in sessions from before 2026-11-22
+    cause = CAUSES.get(remark.cause, "")
     return _reading(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason, cause)
 
 
@@ -254,12 +253,10 @@ def encode_event(event: Event) -> bytes:
 
 
 def decode_event(data: bytes, time_ns: int) -> Event:
-    """The inverse of encode_event; SessionError when it is not one. Events recorded before there was data get that of
-    their sentence."""
+    """The inverse of encode_event; SessionError when it is not one."""
     message = _parse(EVENT, data)
-    kind, text = _get(message, "kind"), _get(message, "text")
-    fields = _json_object(_get(message, "data_json") or "{}", "event") or data_of_sentence(kind, text)
-    return Event(time_ns, _get(message, "level"), kind, text, fields)
+    fields = _json_object(_get(message, "data_json") or "{}", "event")
+    return Event(time_ns, _get(message, "level"), _get(message, "kind"), _get(message, "text"), fields)
 
 
 def encode_log(event: Event) -> bytes:

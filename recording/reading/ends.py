@@ -60,7 +60,7 @@ def lost_end(
 
 def frames_of_plan(events: Iterable[Event], frames: int) -> str:
     """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the recording has no number
-    of planned frames (format 1 has none), or when there are as many."""
+    of planned frames, or when there are as many."""
     planned = [event.data.get("frames") for event in events if event.kind in TELL_PLAN]
     last = planned[-1] if planned else None
     return f"; {frames} of the {last} frames of the plan are there" if isinstance(last, int) and frames < last else ""

@@ -20,7 +20,7 @@ from recording.format.damage import DAMAGE, reading
 from recording.format.decoded_items import event_of, step_of
 from recording.format.holes import holes_in, segments_text
 from recording.format.inventory import SegmentFile, State, inventory
-from recording.format.layout import FINISHED, FRAMES, TELEMETRY, later_format
+from recording.format.layout import FINISHED, FRAMES, TELEMETRY, unknown_format
 from recording.format.mcap_bytes import Source
 from recording.format.records import Head, read_head, telemetry_messages
 from recording.format.summary import Summary, read_summary
@@ -81,7 +81,7 @@ class Glance:
             return Files.DAMAGED
         if self.missing:
             return Files.INCOMPLETE
-        return Files.UNKNOWN if later_format(self.metadata) else Files.SOUND
+        return Files.UNKNOWN if unknown_format(self.metadata) else Files.SOUND
 
     @property
     def lacks(self) -> str:
@@ -91,7 +91,7 @@ class Glance:
     @property
     def state_text(self) -> str:
         """The same with the first reason: `incomplete: telemetry/0003.mcap is missing`."""
-        reasons = self.troubles or self.missing or tuple(filter(None, [later_format(self.metadata)]))
+        reasons = self.troubles or self.missing or tuple(filter(None, [unknown_format(self.metadata)]))
         more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
         return f"{self.state}: {reasons[0]}{more}" if reasons else str(self.state)
 

@@ -87,7 +87,7 @@ class Overview:
 
     @property
     def planned_steps(self) -> int | None:
-        """How many steps the plan of the run has, None when that is not recorded, as in format 1."""
+        """How many steps the plan of the run has, None when that is not recorded."""
         begins = [event.data.get("steps") for event in self.events if event.kind in TELL_PLAN]
         planned = begins[-1] if begins else None
         return planned if isinstance(planned, int) else None

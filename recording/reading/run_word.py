@@ -24,15 +24,12 @@ class Run(StrEnum):
 
 class Files(StrEnum):
     """sound: everything that was acknowledged is there and as it was written. incomplete: something of it is missing.
-    damaged: something is not as it was written. unknown: by a later version, whose format this one does not know."""
+    damaged: something is not as it was written. unknown: by another version, whose format this one does not know."""
 
     SOUND = "sound"
     INCOMPLETE = "incomplete"
     DAMAGED = "damaged"
     UNKNOWN = "unknown"
-
-
-_STOPPED_BY_OPERATOR = "interrupted"  # what the journals of format 1 call it
 
 
 def last_run_event(events: Iterable[Event]) -> Event | None:
@@ -42,24 +39,16 @@ def last_run_event(events: Iterable[Event]) -> Event | None:
 
 
 def run_word(events: Iterable[Event], journal: JournalFacts | None, *, is_recording: bool = False) -> Run:
-    """By the recording or by its journal, whichever has the later entry. A session of format 1 without its journal
-    says of an unfinished run no more than that."""
+    """By the recording or by its journal, whichever has the later entry."""
     if is_recording:
         return Run.RUNNING
     last = last_run_event(events)
     ended_ns = -1 if last is None else last.time_ns
     if journal is not None and (journal.last_ns > ended_ns or (journal.status and journal.last_ns == ended_ns)):
-        return _journaled(journal.status)
+        return known_word(journal.status)
     if last is None or last.kind != RUN_END:
         return Run.INTERRUPTED
-    status = last.data.get("status")
-    if status is None and last.level == "info":
-        return Run.COMPLETE
-    return known_word(str(status))
-
-
-def _journaled(status: str) -> Run:
-    return Run.STOPPED if status == _STOPPED_BY_OPERATOR else known_word(status)
+    return known_word(str(last.data.get("status")))
 
 
 def known_word(status: str) -> Run:

@@ -40,7 +40,7 @@ from recording.format.decoded_items import (
 )
 from recording.format.holes import Hole, holes_in
 from recording.format.inventory import State, inventory
-from recording.format.layout import DAMAGED, DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED, later_format
+from recording.format.layout import DAMAGED, DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED, unknown_format
 from recording.format.records import (
     FramePlace,
     Message,
@@ -82,7 +82,7 @@ class Session:
         head = read_head(telemetry[0])
         self.metadata = head.session
         self._attachments = head.attachments
-        if text := later_format(self.metadata):
+        if text := unknown_format(self.metadata):
             raise SessionError(f"{path}: {text}")
         self._salvaged: dict[Path, bool] = {}  # of the segments known to belong here: whether a salvage has made them
         for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others

@@ -25,7 +25,7 @@ from recording.format.layout import (
     SEGMENT_METADATA,
     SESSION_METADATA,
     TELEMETRY,
-    later_format,
+    unknown_format,
 )
 from recording.format.records import Message
 from recording.format.utc_offsets import UtcOffsets, offsets_of
@@ -131,8 +131,8 @@ def _link(file: SegmentFile, check: SegmentCheck) -> Link:
 
 
 def _format(session: Mapping[str, str]) -> Iterator[Finding]:
-    """What a later version of thermostand may have recorded is not known here."""
-    if text := later_format(session):
+    """What another version of thermostand may have recorded is not known here."""
+    if text := unknown_format(session):
         yield Finding(Severity.ERROR, "", f"{text}: what that format adds was not checked", Files.UNKNOWN)
     elif unknown := sorted(session.keys() - {field.name for field in fields(SessionInfo)}):
         names = ", ".join(name[:40] for name in unknown[:6])

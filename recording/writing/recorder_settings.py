@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 from recording.format.images import ImageEncoding
 from recording.format.layout import FORMAT
 
-_NOT_EMPTY = ("format", "extent", "holes")  # left out of the record when they are
+_NOT_EMPTY = ("extent", "holes")  # left out of the record when they are
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class SessionInfo:
     simulated: the devices were fakes, in real or virtual time. On a virtual clock `host` is not recorded: that run on
     another machine is the same session.
 
-    format: of the files, "" for format 1. extent: of a part that was cut out of a session, the range and how the run
+    format: of the files. extent: of a part that was cut out of a session, the range and how the run
     ended, as JSON; holes: of a copy of a session that is not whole, what the original lacked (holes.py).
     """
 

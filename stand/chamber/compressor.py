@@ -63,8 +63,8 @@ def decide(
 
 
 class _Kept(BaseModel):
-    """The file's content. boot_id: since_ns and starts_ns are boot time of that start of the host; without it (virtual
-    time, and files from before 2026-11-22) they are instants of the stand's clock."""
+    """The file's content. boot_id: since_ns and starts_ns are boot time of that start of the host; without it, in
+    virtual time, they are instants of the stand's clock."""
 
     model_config = ConfigDict(strict=True)
 

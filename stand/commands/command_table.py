@@ -36,9 +36,7 @@ app = lazy_app(
         "init": Lazy("stand.commands.init_cli", "Write the folder of a new stand, from what is connected."),
         "recipes": Lazy("stand.commands.installed_cli", "List the installed recipes."),
         "configs": Lazy("stand.commands.installed_cli", "List the installed configurations of stands."),
-        "config": Lazy(
-            "stand.commands.config_cli", "Configuration files: JSON Schemas for editors, files of older versions."
-        ),
+        "config": Lazy("stand.commands.config_cli", "Configuration files: JSON Schemas for editors."),
         "queue": Lazy("stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
         "alert": Lazy("stand.commands.alert_cli", "Alerts to people elsewhere: test them."),
         "token": Lazy("stand.commands.token_cli", "Tokens for the network: add, list, remove, login."),

@@ -36,7 +36,6 @@ from stand.config.chamber_section import ChamberConfig
 from stand.config.dew import DewConfig, EndingConfig
 from stand.config.guard_section import GuardConfig
 from stand.config.interface_section import InterfaceConfig
-from stand.config.older_forms import CAMERA, renewed
 from stand.config.roles import unfit_roles, witnesses
 from stand.config.safe_ranges import check, outside
 from stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
@@ -59,7 +58,7 @@ RegulatorSettings = Annotated[
 ]
 Folder = Literal["", "registers", "recipes", "targets", "optics"]
 MAPPED = ("regulator", "heat_module", "relays", "thermometer_module")  # the devices that have a register map
-LEADING = CAMERA  # the camera by whose temperature soaks, cool-downs and models go
+LEADING = "camera"  # the camera by whose temperature soaks, cool-downs and models go
 _DEVICES = (
     "bus",
     "regulator",
@@ -149,16 +148,22 @@ class StandConfig(Document):
 
     @model_validator(mode="before")
     @classmethod
-    def _of_today(cls, data: object) -> object:
+    def _is_one_of_today(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
         keys = cast("dict[str, object]", data)
+        thermometers = keys.get("thermometers")
         if "bus" not in keys and ("experiments" in keys or "steps" in keys):
             raise ValueError(
                 "is a recipe, and a stand's file is wanted here (one with `bus:`); give a recipe's name first, as in "
                 "`stand run RECIPE --config STAND`"
             )
-        return renewed(keys)
+        if "camera" in keys or (isinstance(thermometers, dict) and "channels" in thermometers):
+            raise ValueError(
+                "was made for an earlier, unreleased version; put the camera below `cameras:` by its name, the module "
+                "of the thermometers into `thermometer_module:`, and its channels by their names into `thermometers:`"
+            )
+        return keys
 
     @model_validator(mode="after")
     def _cross_checks(self) -> Self:

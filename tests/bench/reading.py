@@ -26,7 +26,7 @@ from foundation.items import Batch
 from foundation.readings import Frame, Reading
 from recording.format import kinds, messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from recording.reading.session import Session
 from recording.writing.forms import telemetry_topics
 from recording.writing.segment import Record, SeriesForm, Topic
@@ -44,7 +44,7 @@ SEGMENTS = 5
 NIGHT_s = 16 * 3600
 TEMPERATURES = tuple(f"thermometers.{place}" for place in kinds.THERMOMETERS)
 TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in kinds.THERMOMETERS)
-METADATA = {"session_id": "bench"}
+METADATA = {"format": str(FORMAT), "session_id": "bench"}
 ATTACHMENTS = {"config.yaml": "a: 1\n" * 400}
 
 

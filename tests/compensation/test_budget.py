@@ -181,7 +181,8 @@ def published(index: int, time_ns: int, started: bool) -> Iterator[Item]:
         scene = Scene(size=(640, 480), f_px=2000, diameter_mm=10, shift_mm=(shift_mm, 0.0))
         image = photograph(scene, render(scene), index)
         yield Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, index, 0, 0, f"step-{index}")
-        yield Event(time_ns, "info", "home_residual", "linear: home was at 0.00300 mm (0.24 steps)")
+        data = {"axis": "linear", "residual": 0.003, "unit": "mm"}
+        yield Event(time_ns, "info", "home_residual", "linear: home was at 0.00300 mm (0.24 steps)", data)
 
 
 async def record(directory: Path) -> None:

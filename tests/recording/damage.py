@@ -14,14 +14,14 @@ from foundation.items import Batch, Event
 from foundation.readings import Frame, Reading
 from recording.format import messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from recording.format.records import frame_places, read_frame, telemetry_messages
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
 from recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
-METADATA = {"session_id": "night-1", "operator": "Zoë"}
+METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "Zoë"}
 ATTACHMENTS = {"config.yaml": "camera: {gain_dB: 0.0}\n" * 20, "recipe.yaml": "name: night\n"}
 ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
 TOPICS = {

@@ -19,7 +19,7 @@ from foundation.errors import SessionError
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from recording.format.records import frame_places, read_frame, telemetry_messages
 from recording.reading.overview import overview
 from recording.reading.session import Session
@@ -32,7 +32,7 @@ from recording.writing.telemetry import TelemetryEncoder
 from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
 
 START_NS = 1_767_290_400 * NS_PER_S
-METADATA = {"session_id": "night-1", "operator": "J. Krukowski"}
+METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n"}
 ENCODER = TelemetryEncoder({"camera": "camera"})
 SEGMENTS = (f"{TELEMETRY}/0000.mcap", f"{FRAMES}/0000.mcap")

@@ -148,7 +148,6 @@ async def test_what_was_recorded_after_a_resumption_and_is_gone_is_missed(tmp_pa
         ("error", "aborted: stopped", {"status": "stopped"}, "stopped", Run.STOPPED),
         ("error", "aborted: too hot", {"status": "tripped"}, "tripped", Run.TRIPPED),
         ("error", "failed: a device", {"status": "failed"}, "failed", Run.FAILED),
-        ("error", "aborted: stopped", {}, "interrupted", Run.STOPPED),  # as format 1 has it
         ("error", "aborted: too hot", {}, "tripped", Run.TRIPPED),
         ("info", "complete", {}, "complete", Run.COMPLETE),
     ],
@@ -303,6 +302,14 @@ def test_a_session_of_a_later_format_is_refused_with_a_sentence(tmp_path):
     write_segment(tmp_path / TELEMETRY, TELEMETRY, range(2), finish=True, metadata={**METADATA, "format": "3"})
     with pytest.raises(SessionError, match="is of format '3'; this version of thermostand reads up to 2"):
         Session.open(tmp_path)
+
+
+@pytest.mark.parametrize("format_text", ["", "1"])
+def test_a_session_of_an_earlier_format_is_refused_with_a_sentence(session, format_text):
+    everywhere(session, format=format_text)
+    with pytest.raises(SessionError, match="was recorded by an earlier, unreleased version of thermostand"):
+        Session.open(session)
+    assert verify(session).files is glance(session).state is Files.UNKNOWN
 
 
 def test_of_a_later_format_it_is_unknown_whether_everything_is_there(session):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import os
 import shutil
@@ -19,8 +20,9 @@ from recording.repair.salvage import salvage_unfinished
 from stand.commands.sessions.session_commands import app
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.learned import learn
+from tests.recording.recorded import record
+from tests.recording.runs import SECONDS, entries, second, write_journal
 
-RECORDED = Path(__file__).parent / "data" / "20260101T180000Z-format-1"
 LONGEST_S = 60  # for 10 s of a machine that has nothing else to do
 
 
@@ -38,9 +40,19 @@ def _not_for_ever() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run of the installed stand."""
+    folder = tmp_path_factory.mktemp("recorded") / "night"
+    config_text = packaged("", "simulated").read_text("utf-8")
+    asyncio.run(record(folder, SECONDS, second, segment_s=60.0, attachments={"config.yaml": config_text}))
+    write_journal(folder, *entries())
+    return folder
+
+
 @pytest.fixture
-def session(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(RECORDED, tmp_path / "sessions" / RECORDED.name))
+def session(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "sessions" / recorded.name))
 
 
 HOSTILE: dict[str, Callable[[Path], object]] = {

@@ -17,7 +17,7 @@ from foundation.items import Batch
 from foundation.readings import Frame, Quality, Reading, bad_reading
 from recording.format import messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from recording.format.records import telemetry_messages
 from recording.reading.session import Session
 from recording.writing.forms import telemetry_topics
@@ -28,7 +28,7 @@ from recording.writing.telemetry import BatchEncoder, TelemetryEncoder
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
 
-METADATA = {"session_id": "night-1"}
+METADATA = {"format": str(FORMAT), "session_id": "night-1"}
 
 
 def at(second):

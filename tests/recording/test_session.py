@@ -11,14 +11,14 @@ from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading
 from recording.format import messages
 from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FRAMES, TELEMETRY
+from recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from recording.reading.session import Session
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
 from recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
-METADATA = {"session_id": "night-1", "operator": "J. Krukowski"}
+METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n", "target.yaml": "rows: 6\n"}
 ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
 TELEMETRY_TOPICS = (

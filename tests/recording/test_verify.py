@@ -320,14 +320,14 @@ async def test_frames_the_recorder_says_it_lost_are_notes(tmp_path):
     def items(time_ns, index):
         yield from second(time_ns, index)
         if index == SECONDS - 1:
-            text = "frames lost: 4 (block 104 and blocks 105 to 106, 107 of step capture), 4 in all; disk full"
-            yield Event(time_ns, "error", "frames_dropped", text)
+            text = "frames lost: 4 (blocks 104 to 107 of step capture), 4 in all; disk full"
+            yield Event(time_ns, "error", "frames_dropped", text, {"blocks": [[104, 107]]})
 
     directory = await recorded(tmp_path / "s", items)
     (directory / "frames" / "0001.mcap").unlink()
     assert errors(directory) == ["error: frames/0001.mcap: is missing"]
     assert notes(directory)[0].startswith("note: 4 frames are described but lost by the recorder, as its events say")
-    assert notes(directory)[1].startswith("note: 2026-01-01 18:00:11 UTC: frames lost: 4 (block 104 and")
+    assert notes(directory)[1].startswith("note: 2026-01-01 18:00:11 UTC: frames lost: 4 (blocks 104 to")
 
 
 async def test_silence_of_everything_and_of_one_device_are_notes(tmp_path):

@@ -101,10 +101,10 @@ def test_a_step_of_the_system_clock_between_two_daemons_changes_neither_rest_nor
         (BOOT, Boot("two", BOOT.began_ns)),
         (BOOT, Boot("", BOOT.began_ns)),
         (Boot("", BOOT.began_ns), Boot("", BOOT.began_ns)),
-        (None, BOOT),  # as files of before boot times were kept
+        (None, BOOT),
         (BOOT, None),
     ],
-    ids=["another boot", "a boot without a name", "neither has a name", "an old file", "virtual time"],
+    ids=["another boot", "a boot without a name", "neither has a name", "of virtual time", "virtual time"],
 )
 def test_a_file_of_another_boot_means_switched_off_just_now(tmp_path: Path, kept_by: Boot | None, read_by: Boot | None):
     keep(tmp_path / "file", CompressorState(False, NOW_NS - seconds_ns(7200), STARTS_NS), kept_by)

@@ -1,4 +1,4 @@
-"""Cameras, thermometers and axes are named in a stand's file: none of them, several, and the forms of before."""
+"""Cameras, thermometers and axes are named in a stand's file: none of them, or several."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,27 +16,6 @@ from stand.config.recipe import Recipe
 from stand.config.stand_config import StandConfig, packaged
 from stand.estimating.estimate import price
 
-OLDER = """
-name: of before
-target: paper-9x6
-bus: {address: "tcp:127.0.0.1:15020"}
-regulator: {registers: omron-e5cc, unit: 1}
-relays:
-  registers: waveshare-relay
-  unit: 2
-  channels: {heater_enable: 0, compressor: 1, camera_power: 2}
-thermometers:
-  registers: icpdas-m7015
-  unit: 3
-  poll_s: 5.0
-  channels:
-    granite_inside: {channel: 0}
-    air: {channel: 3, polynomial: [0, 0.2]}
-flap: {serial_number: "00351210"}
-camera: {address: 127.0.0.20, exposure_s: 0.2, temperature: {entry: Mainboard}}
-guard: {accept: [thermometers.channels.air.polynomial], stale_after_s: 15.0}
-"""
-
 
 def changed(change: Callable[[dict[str, Any]], object]) -> StandConfig:
     data = yaml.safe_load(packaged("", "simulated").read_text())
@@ -52,38 +31,18 @@ def plan(recipe: str, config: StandConfig) -> object:
     return price(load_document(packaged("recipes", recipe), Recipe).plan(), config)
 
 
-def test_a_file_of_before_opens_as_if_it_had_todays_form():
-    found = parse_document(OLDER, StandConfig, "older.yaml")
-    assert found.cameras.keys() == {"camera"}
-    assert found.cameras["camera"].exposure_s == 0.2
-    assert found.thermometer_module.model_dump() == {
-        "registers": "icpdas-m7015",
-        "unit": 3,
-        "poll_s": 5.0,
-        "further_units": (),
-    }
-    assert found.thermometers["air"].polynomial == (0.0, 0.2)
-    assert found.accepted() == {"thermometers.air.polynomial": 20.0}
-
-
 @pytest.mark.parametrize(
-    ("added", "sentence"),
+    "change",
     [
-        ("cameras: {}", "camera and cameras are both given"),
-        (
-            "thermometer_module: {registers: icpdas-m7015, unit: 3}",
-            "thermometer_module and thermometers.channels are b",
-        ),
+        lambda data: data.update(camera=data.pop("cameras")["camera"]),
+        lambda data: data.update(thermometers={**data.pop("thermometer_module"), "channels": data["thermometers"]}),
     ],
 )
-def test_both_forms_in_one_file_are_refused(added: str, sentence: str):
-    with pytest.raises(ConfigError, match=f"^older.yaml: {sentence}"):
-        parse_document(OLDER + added, StandConfig, "older.yaml")
-
-
-def test_a_fault_in_a_file_of_before_is_reported_at_todays_place():
-    with pytest.raises(ConfigError, match=r"^older.yaml: cameras.camera.exposure_s: must be greater than 0"):
-        parse_document(OLDER.replace("exposure_s: 0.2", "exposure_s: 0"), StandConfig, "older.yaml")
+def test_a_file_of_an_earlier_version_is_refused_and_says_what_goes_where(
+    change: Callable[[dict[str, Any]], object],
+):
+    with pytest.raises(ConfigError, match=r"^stand.yaml: was made for an earlier, unreleased version"):
+        changed(change)
 
 
 def test_a_stand_without_cameras_axes_and_spare_thermometers_is_made():

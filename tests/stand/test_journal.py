@@ -26,7 +26,7 @@ ENTRIES = [
     Tripped(6, "over_temperature", "too hot"),
     Cleared(8),
     Step(9, "a1", "done"),
-    Ended(10, "interrupted", "stopped by the operator: “✓”\n"),
+    Ended(10, "stopped", "stopped by the operator: “✓”\n"),
 ]
 
 times_ns = st.integers(0, 2**62)

@@ -120,23 +120,6 @@ def test_the_lines_of_a_journal_make_the_same_state(entries):
     assert fold(PLAN, read_lines(lines)[0]) == fold(PLAN, written)
 
 
-OLD = b"""\
-572ccb08 {"entry": "Begun", "time_ns": 1767290410650000000, "run": "20260101T180000Z-warm", "plan": \
-"ad3190b2c63808e9", "texts": {"config.yaml": "aa1f5212ae546e79", \
-"recipe.yaml": "41b3154da3e88692", "target.yaml": "00dc7edb33b066d7"}, \
-"seed": 1}
-908cafae {"entry": "Step", "time_ns": 1767290410650000000, "step_id": "300c383f4748", "state": "started"}
-94f02eb6 {"entry": "Step", "time_ns": 1767290410800000000, "step_id": "300c383f4748", "state": "done"}
-b7a497cf {"entry": "Dwell", "time_ns": 1767290498900000000, "step_id": "a3f5ce16725c", "earned_s": 60.0}
-21549590 {"entry": "Held", "time_ns": 1767290507600000000, "reason": "interlock", "held": true}
-d1ca24ec {"entry": "Cleared", "time_ns": 1767290560650000000}
-1701a400 {"entry": "Again", "time_ns": 1767290560650000000, "step_ids": ["5ad769f71479", "153e3deaed10", \
-"511dd54d2a88", "abda167cb1de", "78b30c06fba1", "5600e5a40ea3", "ea038b26529d", "fb2903a59a45"]}
-291ded75 {"entry": "Gap", "from_ns": 1767290508850000000, "time_ns": 1767290619500000000}
-4bf0d7d8 {"entry": "Ended", "time_ns": 1767291659150000000, "status": "complete", "text": "complete"}
-"""
-
-
 @pytest.mark.parametrize(
     "entry",  # of wrong types, as a damaged or foreign line may hold
     [
@@ -160,15 +143,6 @@ def test_entries_that_no_run_has_written_are_refused(entry):
 def test_steps_that_are_none_are_refused(by):
     with pytest.raises(ConfigError):
         folded(PLAN, [Edited(0, 13, by)])
-
-
-def test_a_journal_of_the_version_before_changes_of_plans_is_read():
-    entries, size_bytes = read_lines(OLD)
-    assert size_bytes == len(OLD)
-    kinds = ["Begun", "Step", "Step", "Dwell", "Held", "Cleared", "Again", "Gap", "Ended"]
-    assert [type(entry).__name__ for entry in entries] == kinds
-    state = fold(PLAN, entries)
-    assert (state.done, state.earned_s, state.ended.status) == ({"300c383f4748"}, {"a3f5ce16725c": 60.0}, "complete")
 
 
 @pytest.mark.parametrize(

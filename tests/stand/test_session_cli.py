@@ -175,9 +175,7 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
 def test_info_tells_what_the_recorder_lost(tmp_path: Path):
     def items(time_ns: int, index: int):
         yield from half_second(time_ns, index)
-        yield Event(
-            time_ns, "error", "frames_dropped", f"frames lost: 1 (block {index} of step a), {index} in all; full"
-        )
+        yield Event(time_ns, "error", "frames_dropped", "frames lost: 1", {"blocks": [[index, index]]})
 
     asyncio.run(record(tmp_path / "s", 3, items=items))
     said = " ".join(ask("info", tmp_path / "s").stdout.split())

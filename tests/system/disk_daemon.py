@@ -68,7 +68,7 @@ async def main(directory):
     patience.begin()
     try:
         try:
-            await log.end(Ended(0, "interrupted", "stopped"), patience)
+            await log.end(Ended(0, "stopped", "stopped"), patience)
         finally:
             recording.cancel()
             await asyncio.wait([recording])

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-OLD = Path(__file__).parents[1] / "recording" / "data" / "20260101T180000Z-format-1"
+from tests.recording.runs import record_run
+
 HEAVY = ("numba", "scipy", "cv2", "matplotlib")
 
 WORK = {
@@ -47,8 +48,9 @@ def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(recipe: str,
     assert loaded(code) - {"cv2"} == heavy  # frames are encoded with OpenCV
 
 
-def test_reading_a_session_loads_no_heavy_library_until_a_frame_is_decoded():
-    code = f"from recording import Session; s = Session.open({str(OLD)!r}); s.channels(); s.frames_table(); s.holes"
+async def test_reading_a_session_loads_no_heavy_library_until_a_frame_is_decoded(tmp_path: Path):
+    night = str(await record_run(tmp_path / "night"))
+    code = f"from recording import Session; s = Session.open({night!r}); s.channels(); s.frames_table(); s.holes"
     assert loaded(code) == set()
     assert loaded(f"{code}; s.frame(0)") == {"cv2"}
 

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ from typer.testing import CliRunner
 
 from drivers.wires.camera_settings import TemperatureFeature
 from foundation.errors import ConfigError, StandTripped
+from foundation.sealed import seal
 from recording.reading.session import Session
 from stand.commands.command_table import app
 from stand.config.stand_config import StandConfig, load_config, packaged
@@ -89,29 +89,6 @@ def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_sai
     assert recorded[0]["stand"] == []
     assert session.frame_count == 2
     assert not trace.exists()
-
-
-def older(text: str) -> str:
-    """The configuration as files were before 2026-11-22."""
-    data = yaml.safe_load(text)
-    data["camera"] = data.pop("cameras")["camera"]
-    data["thermometers"] = {**data.pop("thermometer_module"), "channels": data.pop("thermometers")}
-    return yaml.safe_dump(data)
-
-
-@pytest.mark.usefixtures("_aravis")
-def test_a_session_with_a_configuration_of_an_older_form_is_resumed(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(CAPTURES)
-    ordered = replace(ordered, config_text=older(ordered.config_text))
-    with pytest.raises(Interrupted):
-        asyncio.run(run_virtual(ordered, tmp_path / "out", None, stopped()))
-    (directory,) = (tmp_path / "out").glob("*-captures")
-    resumed = CliRunner().invoke(app, ["resume", str(directory)])
-    assert resumed.exit_code == 0, resumed.output
-    assert not [line for line in resumed.stderr.splitlines() if "as on this stand" in line]
-    session = Session.open(directory)
-    assert session.frame_count == 2
-    assert "channels:" in (session.attachment("config.yaml") or "")
 
 
 @pytest.mark.usefixtures("_aravis")
@@ -211,7 +188,7 @@ def test_a_queue_that_names_another_folder_is_refused_and_nothing_is_run(tmp_pat
     file = out / QUEUE_NAME
     queue = json.loads(file.read_text())
     queue["entries"][0] |= {"session": session, "state": "interrupted"}
-    file.write_text(json.dumps(queue))
+    file.write_bytes(seal("queue", json.dumps(queue)))
     before = sorted(tmp_path.rglob("*"))
     for command in (["start", "--virtual-time"], ["list"]):
         refused = CliRunner().invoke(app, ["queue", *command, "--out", str(out)], catch_exceptions=False)

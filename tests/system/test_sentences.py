@@ -130,13 +130,6 @@ def test_no_sentence_is_read():
     assert found == []
 
 
-def test_the_reader_of_old_sessions_sentences_is_asked_in_one_place():
-    """Where events are decoded that have no data; nothing that is recorded now depends on it."""
-    files = [path for room in ROOMS for path in (BETWEEN_RUNS / room).rglob("*.py")]
-    askers = [str(path.relative_to(BETWEEN_RUNS)) for path in files if "old_sentences import" in path.read_text()]
-    assert askers == ["recording/format/messages.py"]
-
-
 @pytest.mark.parametrize(
     "line",
     [

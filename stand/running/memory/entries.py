@@ -66,7 +66,7 @@ class Step:
 @dataclass(frozen=True, slots=True)
 class Dwell:
     """A soak has earned `earned_s`; also after its end, when it has to be earned again. ended: once it has, with the
-    chamber in its band or without ("" in journals from before 2026-11-27)."""
+    chamber in its band or without."""
 
     time_ns: int
     step_id: str
@@ -94,7 +94,7 @@ class Gap:
 @dataclass(frozen=True, slots=True)
 class Again:
     """These steps count as neither begun nor done from now on, and no frame of theirs before counts. frames_lost: by
-    the disk, when it is for them (0 in journals from before 2026-11-24)."""
+    the disk, when it is for them."""
 
     time_ns: int
     step_ids: list[str]
@@ -150,10 +150,10 @@ class Cleared:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How the run ended, and why. `interrupted` is what journals of format 1 call `stopped`, by the operator."""
+    """How the run ended, and why."""
 
     time_ns: int
-    status: Literal["complete", "stopped", "tripped", "failed", "interrupted"]
+    status: Literal["complete", "stopped", "tripped", "failed"]
     text: str
 
 
