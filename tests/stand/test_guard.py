@@ -23,11 +23,14 @@ def _ended_notifiers() -> Iterator[None]:
 async def test_permits_may_be_renewed_while_every_rule_holds_and_the_guard_looks():
     bench = Bench("abort", "hold", "warn")
     assert not bench.guard.may_permit()
+    assert not bench.guard.is_on_time
     assert await bench.run_for(11.5)
     assert bench.guard.may_permit()
+    assert bench.guard.is_on_time
     bench.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(2.1))
     bench.guard.clock = bench.clock
     assert not bench.guard.may_permit()  # nobody has looked for more than two periods
+    assert not bench.guard.is_on_time
     assert bench.log == []
 
 
@@ -36,6 +39,7 @@ async def test_an_abort_latches_then_makes_safe_and_ends_the_watch():
     bench.objecting = {0, 1}
     assert not await bench.run_for(3)
     assert bench.log == ["stop rule1", "revoke", "safe"]
+    assert not bench.guard.is_on_time
     assert [(event.level, event.kind, event.text) for event in bench.events] == [("error", "guard.rule1", "it is so")]
 
 

@@ -124,6 +124,11 @@ def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_pat
     assert table.look(5000) == []
 
 
+def test_before_anything_is_said_no_capture_is_under_way_and_frames_are_taken():
+    announced = Announcements()
+    assert (announced.is_capturing, announced.frames_stopped, announced.is_paused) == (False, "", False)
+
+
 def test_all_other_events_and_steps_are_no_business_of_the_rules():
     table = Table()
     table.hub.publish(Event(0, "error", "frames_dropped", "the disk is too slow"))

@@ -363,6 +363,24 @@ def test_a_step_that_is_left_out_ends_what_is_under_way_only_when_that_is_it():
     assert (state.under_way, state.due_ns, state.plan[state.index]) == ("", None, PLAN[6])
 
 
+def test_the_end_of_a_step_ends_what_is_under_way_only_when_that_is_it():
+    state = fold(PLAN, [*STATES["one was lost"], Step(0, WARM, "done")])
+    assert (state.under_way, state.due_ns, state.is_lost) == (CAPTURE, 20 * S, True)
+    state = after(state, Step(0, CAPTURE, "done"))
+    assert (state.under_way, state.due_ns, state.is_lost) == ("", None, False)
+
+
+def test_a_capture_of_which_a_step_before_is_done_again_is_neither_under_way_nor_has_lost_a_frame():
+    before = fold(PLAN, STATES["one was lost"])
+    state = after(before, Again(0, [OPEN, CAPTURE]))
+    assert (state.under_way, state.due_ns, state.is_lost) == ("", None, False)
+    assert state.disturbances == before.disturbances + 1
+    assert state.plan[state.index].step_id == OPEN
+    same = after(before, Again(0, [CAPTURE]))
+    assert (same.under_way, same.due_ns, same.is_lost, same.frames) == (CAPTURE, 20 * S, True, {})
+    assert same.disturbances == before.disturbances
+
+
 def test_an_outage_is_what_was_held_or_made_ready_since_the_last_frame_and_counts_once():
     entries = [
         *begun(CAPTURE),

@@ -1,0 +1,127 @@
+"""What only the recording proves is put between the entries of a journal, each once; and what a run writes down in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from foundation.clock import VirtualClock, WallClock
+from foundation.hub import Hub
+from foundation.items import Event, StepMark, StepState
+from recording.format.restarts import restarted
+from recording.reading.contents import PLAN_CHANGED
+from stand.fault import Fault
+from stand.gate import INTERLOCK, OPERATOR, STOPPING
+from stand.running.memory.entries import (
+    Again,
+    Begun,
+    Cleared,
+    Ended,
+    Entry,
+    Held,
+    Skipped,
+    Step,
+    Taken,
+    Tripped,
+    data_of,
+)
+from stand.running.memory.fold import fold
+from stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
+from stand.running.resume import with_recorded
+from tests.journals import read_lines
+from tests.stand.test_run_table import CAPTURE, ID, PLAN, WARM
+
+BEGUN = Begun(1, "night-1", "0f", {})
+
+
+def mark(time_ns: int, step_id: str, state: StepState) -> StepMark:
+    return StepMark(time_ns, step_id, 0, "Capture", state)
+
+
+def plan_changed(change: Skipped) -> Event:
+    return Event(change.time_ns, "warning", PLAN_CHANGED, "left out", data_of(change))
+
+
+def test_a_step_is_done_when_its_end_is_recorded_and_not_when_it_was_begun_or_failed():
+    started = Step(2, CAPTURE, "started")
+    items = [mark(2, CAPTURE, StepState.STARTED), mark(5, WARM, StepState.FAILED), mark(4, CAPTURE, StepState.DONE)]
+    frames = [(3, CAPTURE)]
+    assert with_recorded([BEGUN, started], items, frames) == [
+        BEGUN,
+        started,
+        Taken(3, CAPTURE),
+        Step(4, CAPTURE, "done"),
+    ]
+
+
+def test_a_capture_that_was_begun_again_and_a_change_of_the_plan_count_once_be_they_in_the_journal_or_not():
+    again, skipped = Again(5, [CAPTURE], 2), Skipped(7, WARM)
+    items = [restarted(5, CAPTURE, 3, "", 2), plan_changed(skipped), Event(8, "info", "note", "x", data_of(skipped))]
+    whole: list[Entry] = [BEGUN, again, skipped]
+    assert with_recorded([BEGUN], items, []) == whole
+    assert with_recorded([BEGUN, again], items, []) == whole
+    assert with_recorded([BEGUN, skipped], items, []) == whole
+    assert with_recorded([BEGUN, again, skipped], items, []) == whole
+    other = Again(5, [WARM])
+    assert with_recorded([BEGUN, other], items[:1], []) == [BEGUN, other, again]
+
+
+def test_of_an_instant_in_which_a_capture_is_begun_again_its_end_before_does_not_count_but_its_frame():
+    again = Again(5, [CAPTURE])
+    items = [mark(5, CAPTURE, StepState.DONE)]
+    assert with_recorded([BEGUN, again], items, [(5, CAPTURE)]) == [
+        BEGUN,
+        Step(5, CAPTURE, "done"),
+        again,
+        Taken(5, CAPTURE),
+    ]
+
+
+async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp_path: Path):
+    hub, clock, events = Hub(), VirtualClock(5), list[Event]()
+    hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
+    logbook, journal = Logbook(hub, clock, fold(PLAN, [])), Journal.create(tmp_path)
+    logbook.tripped(Fault("early", "before the run"))
+    assert logbook.state.tripped == "before the run"
+    logbook.enter(Cleared(5))
+    await logbook.begin(journal, BEGUN)
+    for reason, held in ((OPERATOR, True), (STOPPING, True), (INTERLOCK, True), (OPERATOR, False), (INTERLOCK, False)):
+        logbook.held(reason, held)
+    logbook.tripped(Fault("air_hot", "too hot"))
+    assert [(event.kind, event.data["reason"]) for event in events] == [
+        ("held", OPERATOR),
+        ("held", INTERLOCK),
+        ("released", OPERATOR),
+        ("released", INTERLOCK),
+    ]
+    assert (logbook.state.reasons, logbook.state.tripped) == (frozenset(), "too hot")
+    await journal.close()
+    assert read_lines((tmp_path / JOURNAL_NAME).read_bytes())[0] == [
+        BEGUN,
+        Held(5, OPERATOR, True),
+        Held(5, INTERLOCK, True),
+        Held(5, OPERATOR, False),
+        Cleared(5),
+        Held(5, INTERLOCK, False),
+        Tripped(5, "air_hot", "too hot"),
+    ]
+
+
+async def test_the_end_of_a_run_is_the_last_entry_of_its_journal_which_nobody_has_then(tmp_path: Path):
+    class Endless:
+        async def wait(self, task, within_s: float) -> bool:
+            await task
+            return True
+
+    logbook = Logbook(Hub(), WallClock(), fold(PLAN, []))
+    await logbook.end(Ended(1, "stopped", ""), Endless())  # nothing was begun
+    await logbook.begin(Journal.create(tmp_path), BEGUN)
+    await logbook.write(Step(2, ID[0], "started"))
+    await logbook.end(Ended(3, "stopped", "by the operator"), Endless())
+    journal, entries = Journal.open(tmp_path)
+    journal.release()
+    assert entries[:2] == [BEGUN, Step(2, ID[0], "started")]
+    (ended,) = entries[2:]
+    assert isinstance(ended, Ended)
+    assert (ended.status, ended.text) == ("stopped", "by the operator")
+    assert ended.time_ns > 3
+    assert logbook.state.ended == ended
