@@ -1,4 +1,4 @@
-"""What only the recording proves is put between the entries of a journal, each once; and what a run writes down in it."""
+"""What only the recording proves is put between the entries of a journal, each once; and what a run writes in it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from foundation.clock import VirtualClock, WallClock
 from foundation.hub import Hub
 from foundation.items import Event, StepMark, StepState
+from foundation.patience import Patience
 from recording.format.restarts import restarted
 from recording.reading.contents import PLAN_CHANGED
 from stand.fault import Fault
@@ -107,16 +108,11 @@ async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp
 
 
 async def test_the_end_of_a_run_is_the_last_entry_of_its_journal_which_nobody_has_then(tmp_path: Path):
-    class Endless:
-        async def wait(self, task, within_s: float) -> bool:
-            await task
-            return True
-
     logbook = Logbook(Hub(), WallClock(), fold(PLAN, []))
-    await logbook.end(Ended(1, "stopped", ""), Endless())  # nothing was begun
+    await logbook.end(Ended(1, "stopped", ""), Patience())  # nothing was begun
     await logbook.begin(Journal.create(tmp_path), BEGUN)
     await logbook.write(Step(2, ID[0], "started"))
-    await logbook.end(Ended(3, "stopped", "by the operator"), Endless())
+    await logbook.end(Ended(3, "stopped", "by the operator"), Patience())
     journal, entries = Journal.open(tmp_path)
     journal.release()
     assert entries[:2] == [BEGUN, Step(2, ID[0], "started")]
