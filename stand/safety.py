@@ -81,7 +81,7 @@ class _Maker:
 
     def forgive(self) -> None:
         """An operator has taken over: what is not confirmed yet is tried no more."""
-        if self._task is not None and self.confirmed < self.demanded:
+        if self._task is not None:
             self._task.cancel()
         self.failure, self.begun, self.tried, self.confirmed = "", self.demanded, self.demanded, self.demanded
 

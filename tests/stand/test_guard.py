@@ -297,6 +297,21 @@ async def test_a_guard_that_keeps_on_looks_after_an_abort_which_stays_until_it_i
     assert bench.guard.may_permit()
 
 
+async def test_what_only_an_operator_ends_is_latched_before_anything_else_is_done():
+    for action, ends_itself, log in (
+        ("abort", False, ["latch rule0", "stop rule0", "revoke"]),
+        ("hold", False, ["latch rule0", "hold rule0", "revoke"]),
+        ("hold", True, ["hold rule0", "revoke"]),
+    ):
+        bench = Bench(action)
+        bench.guard.watches[0].ends_itself = ends_itself
+        bench.guard.latch = lambda fault, log=bench.log: log.append(f"latch {fault.rule}")
+        bench.objecting = {0}
+        assert bench.guard.look() is (action == "hold")
+        assert bench.log == log
+        await bench.safety.tried()
+
+
 async def test_without_a_way_to_hold_every_trip_aborts():
     bench = Bench("hold", can_hold=False)
     bench.objecting = {0}

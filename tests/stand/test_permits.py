@@ -120,8 +120,10 @@ async def test_heat_lasts_as_long_as_it_is_renewed_and_its_timer_longer():
         await bench.keep(60.0)
         assert (board.is_on(HEATER), permits.gives, permits.timer_s, permits.ended_ns) == (True, True, HOLD_S, None)
         renewed_ns = bench.now_ns - seconds_ns(5.0)
-        await bench.wait(60.0)
+        await bench.wait(HOLD_S - 5.0)
         assert not board.is_on(HEATER)
+        assert permits.ended_ns == bench.now_ns
+        await bench.wait(60.0)
         assert permits.ended_ns == renewed_ns + seconds_ns(HOLD_S)
         assert await permits.arm(0.0, 0.0) == {HEATER: False, COMPRESSOR: False}
         assert (board.is_on(HEATER), permits.ended_ns) == (True, None)
@@ -162,6 +164,7 @@ async def test_a_relay_that_is_off_before_its_time_was_dropped_unless_its_time_i
         await bench.wait(HOLD_S - left_s)
         bench.board.others_switch(HEATER, False)
         await bench.keep(30.0)
+        assert not any("compressor" in event.text for event in bench.events)
         assert bench.told() == told
         assert bench.board.is_on(HEATER)
 
@@ -223,6 +226,7 @@ async def test_a_compressor_that_was_dropped_before_its_time_rests_from_then_on(
         dropped_ns = bench.now_ns
         await bench.keep(300.0, COLD)
         assert bench.kept[1:] == [CompressorState(False, dropped_ns, (begun_ns,))]
+        assert "counts as a stop" in bench.events[1].text
         assert bench.told() == [("compressor", True), ("compressor_dropped", COMPRESSOR)]
         await bench.keep(5.0, COLD)
         assert bench.board.is_on(COMPRESSOR)

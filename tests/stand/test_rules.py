@@ -12,7 +12,7 @@ from foundation.readings import Reading, bad_reading
 from recording.writing.notices import Notice, SpaceWatch
 from stand.config.stand_config import load_config, packaged
 from stand.fault import Fault
-from stand.guarding.rules import Announcements, watches
+from stand.guarding.rules import Announcements, natures, watches
 
 
 class Table:
@@ -122,6 +122,16 @@ def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_pat
     assert "frames are not recorded any more" in found[1].text
     table.hub.publish(Event(0, "info", "frames_resumed", "frames are recorded again"))
     assert table.look(5000) == []
+
+
+def test_what_no_probe_and_no_camera_can_be_is_no_measurement():
+    config = load_config(packaged("", "simulated"))
+    lowest, highest = config.limits.chamber_degC
+    known = natures(config)
+    for channel in ("regulator.pv", "camera.temperature"):
+        low, high = known[channel].range_degC
+        assert -100.0 < low < lowest
+        assert highest < high < 200.0
 
 
 def test_before_anything_is_said_no_capture_is_under_way_and_frames_are_taken():

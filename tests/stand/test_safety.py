@@ -8,7 +8,8 @@ from foundation.clock import VirtualClock, seconds_ns
 from foundation.errors import DeviceFault, Unreachable
 from foundation.hub import Hub
 from foundation.items import Event
-from stand.safety import Pending, Safety
+from stand.config.stand_config import load_config, packaged
+from stand.safety import TRY_LIMIT_S, Pending, Safety
 
 
 class Actuator:
@@ -150,6 +151,10 @@ async def test_two_demands_at_once_are_one():
         bench.safety.demand()
         assert await bench.safety.confirmed(60.0)
         assert bench.flap.calls == [0.0]
+
+
+def test_a_try_that_hangs_is_given_up_before_the_relays_own_time_is_over():
+    assert load_config(packaged("", "simulated")).guard.heater_hold_s > TRY_LIMIT_S
 
 
 async def test_one_that_is_slow_keeps_none_of_the_others():
