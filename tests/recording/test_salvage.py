@@ -1,13 +1,14 @@
 """What a salvage delivers of damaged segments, and where it takes what a segment does not say."""
 
 import random
+import re
 
 import pytest
 
 from recording.format.layout import FRAMES, TELEMETRY, segment_metadata
 from recording.format.records import read_head
 from recording.reading.session import Session
-from recording.repair.salvage import salvage_session
+from recording.repair.salvage import salvage_line, salvage_session
 from recording.repair.verify import Severity, verify
 from tests.nightly import by_night
 from tests.recording.damage import (
@@ -99,6 +100,21 @@ def test_a_block_that_was_being_written_is_no_loss(damaged, series):
         (done,) = salvage_session(folder.parent)
         assert (done.lost_bytes, done.kept) == (0, None)
         assert names(folder) == ["0000.mcap", "0001.mcap"]
+
+
+def test_what_was_wrong_and_what_became_of_it_is_said(damaged):
+    folder, _, _ = damaged(FRAMES, hole(9000, 9100))
+    (done,) = salvage_session(folder.parent)
+    assert re.match(rf"1 damaged place of {done.lost_bytes} bytes, the first at byte \d+$", done.reason)
+    said = salvage_line(done)
+    assert f"{done.messages} messages in 0001.mcap, {done.lost_bytes} bytes lost, the original is kept as" in said
+    folder, _, _ = damaged(FRAMES, lambda data: hole(9000, 9100)(hole(30_000, 30_100)(data)))
+    (done,) = salvage_session(folder.parent)
+    assert done.reason.startswith(f"2 damaged places of {done.lost_bytes} bytes")
+    folder, _, _ = damaged(FRAMES, lambda data: data[:-60])
+    (done,) = salvage_session(folder.parent)
+    assert re.match(r"a block of \d+ bytes was being written at its end$", done.reason)
+    assert salvage_line(done).endswith(f"0001.mcap.part: 23 messages in 0001.mcap ({done.reason})")
 
 
 def test_a_second_damaged_original_of_a_number_gets_a_name_of_its_own(damaged):

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from foundation.errors import SessionError
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.reading.session import Session
-from recording.repair.salvage import BEING_RECORDED, salvage_session, salvage_unfinished
+from recording.repair.salvage import BEING_RECORDED, salvage_line, salvage_session, salvage_unfinished
 from recording.writing.segment import CommitSink
 from tests.recording.damage import (
     METADATA,
@@ -106,6 +106,7 @@ def test_a_living_recording_is_left_alone(damaged):
         fcntl.flock(file, fcntl.LOCK_EX)
         (done,) = salvage_session(folder.parent)
         assert (done.source, done.path, done.reason) == (path, None, BEING_RECORDED)
+        assert salvage_line(done).endswith("frames/0001.mcap.part: left alone, it is being recorded")
         assert path.read_bytes() == written.data[:-5]
     (done,) = salvage_session(folder.parent)
     assert done.path == folder / "0001.mcap"
@@ -164,6 +165,43 @@ def test_a_salvage_that_was_killed_at_any_step_is_repeated(damaged, change):
     assert names(folder) == expected
     assert read_segment(done.path) == kept
     assert salvage_session(folder.parent) == []
+
+
+TORN, DAMAGED = (lambda data: data[:-60]), hole(9000, 9500)
+PLACED = ["replace", "sync_folder"]
+KEPT = ["link", "sync_folder"]
+GONE = ["unlink", "sync_folder"]
+
+
+@pytest.mark.parametrize(
+    ("which", "change", "steps"),
+    [
+        ("part", TORN, ["fsync", *PLACED, *GONE]),
+        ("part", DAMAGED, ["fsync", *KEPT, *PLACED, *GONE]),
+        ("finished", DAMAGED, ["fsync", *KEPT, *PLACED]),
+        ("part", lambda data: b"", GONE),
+    ],
+    ids=["torn", "damaged", "finished and damaged", "empty"],
+)
+def test_each_step_is_on_the_disk_before_the_next_so_that_a_power_cut_loses_nothing(damaged, which, change, steps):
+    folder, _, _ = damaged(FRAMES, change, which)
+    done, sizes = list[str](), list[int]()
+
+    def write_down(frame, event, called):
+        if event != "c_call" or called not in (os.fsync, os.link, os.replace, os.unlink):
+            return
+        is_of_folder = frame.f_code.co_name == "sync_folder"
+        done.append("sync_folder" if is_of_folder else called.__name__)
+        if done[-1] == "fsync":
+            sizes.extend(path.stat().st_size for path in folder.glob("*.tmp"))
+
+    sys.setprofile(write_down)
+    try:
+        (salvaged,) = salvage_session(folder.parent)
+    finally:
+        sys.setprofile(None)
+    assert done == steps
+    assert sizes == ([salvaged.path.stat().st_size] if salvaged.path else [])  # nothing of it waits in memory
 
 
 @contextmanager
