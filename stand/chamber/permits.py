@@ -154,7 +154,7 @@ class Permits:
                     await self._intruded(channel)
             return coils
 
-    async def test_dead_man(self, *, is_timed: bool = False) -> None:
+    async def test_dead_man(self, *, is_timed: bool) -> None:
         """Before the heater's relay is trusted: does the board drop it in time, and does arming it again start its time
         again? DeviceFault when not: such a board would cut the heat at random, or never.
 

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import resource
+import threading
 import zlib
 from pathlib import Path
 
@@ -233,6 +234,41 @@ async def test_a_journal_that_was_removed_is_written_again_with_all_its_lines_an
     reopened.release()
     assert read == ENTRIES[:5]
     assert [each.name for each in tmp_path.iterdir()] == [JOURNAL_NAME]
+
+
+async def test_who_writes_to_a_disk_that_hangs_may_leave_at_once_and_its_line_is_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    begun, hangs, sync = threading.Event(), threading.Event(), os.fdatasync
+
+    def slow(fd: int) -> None:
+        begun.set()
+        hangs.wait(20.0)
+        sync(fd)
+
+    journal = Journal.create(tmp_path)
+    journal.start(WallClock(), pytest.fail)
+    await journal.write(ENTRIES[0])
+    monkeypatch.setattr(os, "fdatasync", slow)
+    writing = asyncio.create_task(journal.write(ENTRIES[1]))
+    await asyncio.to_thread(begun.wait, 20.0)
+    writing.cancel()
+    done, _ = await asyncio.wait([writing], timeout=10.0)
+    assert done
+    hangs.set()
+    await journal.close()
+    assert on_disk(tmp_path) == ENTRIES[:2]
+
+
+async def test_a_journal_that_is_closed_leaves_no_thread(tmp_path: Path):
+    threads = len(os.listdir("/proc/self/task"))
+    journal = Journal.create(tmp_path)
+    journal.start(WallClock(), pytest.fail)
+    await journal.write(ENTRIES[0])
+    await journal.close()
+    async with asyncio.timeout(20.0):
+        while len(os.listdir("/proc/self/task")) > threads:
+            await asyncio.sleep(0.01)
 
 
 async def test_a_journal_whose_folder_comes_back_goes_on_in_it(tmp_path: Path):

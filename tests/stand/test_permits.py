@@ -335,7 +335,7 @@ async def test_a_board_that_never_drops_or_does_not_begin_its_time_again_is_said
 
         bench.board.hold_on = held
         with pytest.raises(DeviceFault, match="is not suited"):
-            await bench.permits.test_dead_man()
+            await bench.permits.test_dead_man(is_timed=False)
         (found,) = bench.events
         assert (found.level, found.kind) == ("error", "dead_man_tested")
         assert (found.data["rearmed"], found.data["dropped"]) == (rearmed, dropped)
@@ -352,7 +352,7 @@ async def test_a_computer_that_is_held_up_in_each_test_of_the_timer_says_so_and_
 
         bench.board.hold_on = late
         with pytest.raises(DeviceFault, match="held up in each of the tests"):
-            await bench.permits.test_dead_man()
+            await bench.permits.test_dead_man(is_timed=False)
         assert [(event.kind, event.data["test"]) for event in bench.events] == [
             ("dead_man_late", number) for number in range(1, 6)
         ]
