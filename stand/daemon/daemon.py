@@ -21,6 +21,7 @@ from foundation.events import RUN_FAILED
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.tasks import cancelled, failure_text, watched
+from recording.reading.contents import RUN_END
 from recording.writing.recorder import FINISH_WITHIN_S
 from stand.daemon import systemd
 from stand.daemon.by_hand import ByHand
@@ -272,8 +273,13 @@ class Daemon:
             has_begun = True
             self._beside(self._hand_over())
 
+        def follow(item: Item) -> None:
+            if has_begun and isinstance(item, Event) and item.kind == RUN_END and not self.orders.leaving:
+                self._beside(self._record_behind())
+
         self.has_guest = True
         self._status.tell(f"run {entry.id} ({entry.recipe})")
+        self._hub.subscribe(follow)
         try:
             await cancelled(list(self._hands))
             await self.orders.read()
@@ -285,6 +291,7 @@ class Daemon:
                 self._tell("error", RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
             raise
         finally:
+            self._hub.unsubscribe(follow)
             if not self.orders.leaving:
                 await self._record_day()
             self.has_guest = False
@@ -296,7 +303,7 @@ class Daemon:
         there is no heat by hand."""
         self._recorded_ns = self._clock.now_ns()
         try:
-            self.open_stand.recorder = self.record.recorder or await self.record.begin()
+            self.open_stand.recorder = await self.record.current()
         except (SessionError, OSError) as error:
             self.open_stand.recorder = None
             self._assembly.stand.safety.demand()
@@ -309,6 +316,11 @@ class Daemon:
         await self._end_record()
         with suppress(SessionError):
             await self.orders.read()
+
+    async def _record_behind(self) -> None:
+        """The record goes on while the run that has ended is still completed; `_record_day` says when it cannot."""
+        with suppress(SessionError, OSError):
+            await self.record.current()
 
     async def _end_record(self) -> None:
         try:

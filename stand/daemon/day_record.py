@@ -1,8 +1,8 @@
 """The daemon's own record between runs: one session a day, `20261122-house`, begun at local midnight.
 
 What is done by hand is recorded as in a run, and heat depends on it in the same way. While a run records, the
-daemon does not: each instant is in one session. Old ones are removed (`recording.idle_log_days`), but none that has a
-note or a tag.
+daemon does not, but for the moments in which one takes over from the other: each instant is in a session. Old ones are
+removed (`recording.idle_log_days`), but none that has a note or a tag.
 """
 
 from __future__ import annotations
@@ -91,22 +91,30 @@ class DayRecord:
         """The record of today. That of the day before is cut off in the same moment, so that each item is in one of
         both, and `complete` completes it. SessionError when the disk refuses; that of the day before then goes on."""
         async with self._turn:
-            day = self._today()
-            info = self._info(await self._lane.call(self._place, day))
-            directory = self._out / info.session_id
-            tap, disk = _Tap(self._assembly.hub), Disk()
-            recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk)
-            try:
-                await recorder.begin(tuple)
-            except BaseException:
-                await disk.ended_within(self._patience)
-                raise
-            self._cut()
-            self._day = day
-            self._now = _Recording(recorder, tap, disk, asyncio.create_task(recorder.run()))
-            tell_identities(self._assembly)
-            self._removal = asyncio.create_task(self._remove_old())
-            return recorder
+            return await self._begun()
+
+    async def current(self) -> Recorder:
+        """The record under way, which is begun where there is none. As `begin`."""
+        async with self._turn:
+            return self.recorder or await self._begun()
+
+    async def _begun(self) -> Recorder:
+        day = self._today()
+        info = self._info(await self._lane.call(self._place, day))
+        directory = self._out / info.session_id
+        tap, disk = _Tap(self._assembly.hub), Disk()
+        recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk)
+        try:
+            await recorder.begin(tuple)
+        except BaseException:
+            await disk.ended_within(self._patience)
+            raise
+        self._cut()
+        self._day = day
+        self._now = _Recording(recorder, tap, disk, asyncio.create_task(recorder.run()))
+        tell_identities(self._assembly, tap.give)  # a run that is still completed has said them
+        self._removal = asyncio.create_task(self._remove_old())
+        return recorder
 
     async def complete(self, within_s: float = COMPLETE_WITHIN_S) -> None:
         """Complete the segments of what was cut off; SessionError when the disk does not take them in time."""

@@ -265,7 +265,7 @@ async def _stay(
     """From the camera's start to the end of the recording."""
     is_camera_on = job.before is None or job.before.kept.set_up.camera_on
     async with AsyncExitStack() as stack:
-        tell_identities(open_stand.assembly)
+        tell_identities(open_stand.assembly, open_stand.assembly.hub.publish)
         if is_camera_on:
             await open_stand.or_safe(_with_camera(open_stand.assembly), stop)
         recorder = await open_stand.or_safe(_recording(job, directory, open_stand.assembly, early, disk), stop)

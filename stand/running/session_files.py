@@ -6,7 +6,7 @@ import importlib.metadata
 import itertools
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -55,17 +55,17 @@ def camera_serials(assembly: Assembly) -> str:
     return ", ".join(camera.identity.serial_number for camera in assembly.devices.cameras.values())
 
 
-def tell_identities(assembly: Assembly) -> None:
+def tell_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
     """Which devices have answered, as events, but for the cameras, which are reported when they are on; and what the
-    stand lacks."""
+    stand lacks. tell: gets them."""
     devices, now_ns = assembly.devices, assembly.clock.now_ns()
     units = (devices.regulator, devices.relays, devices.heat_module, devices.thermometers, devices.inputs, devices.flap)
     for device in (*units, *devices.axes.values(), *devices.probes.values()):
         if device is not None and device.identity is not None:
-            assembly.hub.publish(identity_event(device.name, device.identity, now_ns))
+            tell(identity_event(device.name, device.identity, now_ns))
     for text in absences(assembly.config):
         what = text.partition(":")[0].removeprefix("no ")
-        assembly.hub.publish(Event(now_ns, "info", "absent", text, {"what": what}))
+        tell(Event(now_ns, "info", "absent", text, {"what": what}))
 
 
 def recorder_of(
