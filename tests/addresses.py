@@ -48,7 +48,11 @@ def move_to_free(stand: dict[str, Any], folder: Path) -> dict[str, Any]:
     stand["bus"]["address"] = f"tcp:127.0.0.1:{free_port()}"
     for name, axis in stand["axes"].items():
         axis["address"] = f"serial:{folder / name}"
-    stand["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
+    if "flap" in stand:
+        stand["flap"]["backend_address"] = f"tcp:127.0.0.1:{free_port()}"
+    for device in (stand.get("climate_chamber"), *stand.get("probes", {}).values()):
+        if device is not None:
+            device["address"] = f"tcp:127.0.0.1:{free_port()}"
     for camera in stand["cameras"].values():
         camera["address"] = camera_address()
     stand["simulation"]["control"] = f"tcp:127.0.0.1:{free_port()}"

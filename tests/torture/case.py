@@ -15,6 +15,7 @@ import yaml
 from drivers.sim.laboratory_faults import FAULTS
 
 START_NS = 1_767_290_400_000_000_000  # 2026-01-01 18:00 UTC, as the installed simulated stand has it
+LASTS_S = (5.0, 20.0, 60.0, 300.0, 1800.0)  # of faults
 MOST_FAULTS, MOST_ORDERS, MOST_KILLS = 8, 6, 3
 LEFT_OUT = 0.5  # of the kinds, in each seed: what one kind hides of another shows then
 
@@ -157,7 +158,7 @@ UNDONE = {
 def draw(seed: int) -> Case:
     """The case of a seed."""
     drawn = random.Random(seed)
-    stand = _stand(drawn)
+    stand = draw_stand(drawn)
     plan, duration_s = _plan(drawn, stand)
     left = {kind for kind in (*KINDS, *ORDERS, "kill") if drawn.random() >= LEFT_OUT}
     return Case(
@@ -167,13 +168,13 @@ def draw(seed: int) -> Case:
         chamber_seed=drawn.choice((None, drawn.randrange(1000))),
         laboratory_degC=drawn.choice((24.0, 18.0, 30.0)),
         attended=drawn.random() < 0.3,
-        faults=tuple(_faults(drawn, stand, left, duration_s)),
+        faults=tuple(draw_faults(drawn, stand, left & KINDS.keys(), duration_s, LASTS_S, MOST_FAULTS)),
         orders=tuple(_orders(drawn, left, duration_s)),
         kills_s=_kills(drawn, left, duration_s),
     )
 
 
-def _stand(drawn: random.Random) -> dict[str, str]:
+def draw_stand(drawn: random.Random) -> dict[str, str]:
     from tests.system.test_stand_combinations import NOT_SIMULATED, PLACES
 
     names = {place: [each.name for each in choices] for place, choices in PLACES.items()}
@@ -212,21 +213,29 @@ def _plan(drawn: random.Random, stand: dict[str, str]) -> tuple[dict[str, list[A
     return {"steps": [*steps, "stop_chamber"]}, duration_s
 
 
-def _faults(drawn: random.Random, stand: dict[str, str], left: set[str], duration_s: float) -> Iterator[Fault]:
-    names = [name for name in KINDS if name in left and _HAS[name.partition(".")[0]](stand)]
+def draw_faults(
+    drawn: random.Random,
+    stand: dict[str, str],
+    kinds: Iterable[str],
+    within_s: float,
+    lasts_s: tuple[float, ...],
+    most: int,
+) -> Iterator[Fault]:
+    """At most so many of these kinds that such a stand can have, each for one of these times."""
+    names = [name for name in sorted(kinds) if _HAS[name.partition(".")[0]](stand)]
     is_beyond = False
-    for name in drawn.choices(names, k=drawn.randrange(MOST_FAULTS + 1)) if names else ():
+    for name in drawn.choices(names, k=drawn.randrange(most + 1)) if names else ():
         if name in BEYOND and is_beyond:
             continue
         is_beyond = is_beyond or name in BEYOND
-        for_s = drawn.choice((5.0, 20.0, 60.0, 300.0, 1800.0))
+        for_s = drawn.choice(lasts_s)
         if name.partition(".")[2] in _TIMES_OUT:
             for_s = min(for_s, 20.0)  # each time-out takes real time
-        yield Fault(name, _value(drawn, name, stand), round(drawn.uniform(0.0, duration_s), 1), for_s)
+        yield Fault(name, _value(drawn, name, stand), round(drawn.uniform(0.0, within_s), 1), for_s)
 
 
 def _value(drawn: random.Random, name: str, stand: dict[str, str]) -> Any:
-    worst, names = KINDS[name], _NAMES.get(stand["thermometers"], ("air",))
+    worst, names = FAULTS[name].worst, _NAMES.get(stand["thermometers"], ("air",))
     match name:
         case "inputs.changed":
             return "door"

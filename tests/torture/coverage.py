@@ -6,10 +6,12 @@ import inspect
 from collections import Counter
 from collections.abc import Iterator, Mapping
 
+from drivers.sim.laboratory_faults import FAULTS
 from foundation.events import GUARD
 from stand.running.memory import entries
 from stand.watching.remedies import rows
 from tests.torture.case import KINDS, ORDERS
+from tests.torture.real import KINDS as REAL
 from tests.torture.rig import Result
 
 
@@ -17,7 +19,8 @@ class Reached:
     """How often each was: kinds of faults and orders, rules of the guard, kinds of events, entries of the journal, and
     ends of the program."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_real: bool = False) -> None:
+        self._known = everything(is_real=is_real)
         self.counts: dict[str, Counter[str]] = {
             name: Counter() for name in ("kinds", "rules", "events", "entries", "ends")
         }
@@ -35,20 +38,20 @@ class Reached:
 
     def told(self) -> Iterator[str]:
         """Two lines for each: what was, and what was not."""
-        known = everything()
+        known = self._known
         for name, counts in self.counts.items():
             yield f"{name}: {', '.join(f'{each} {number}' for each, number in counts.most_common())}"
             if missing := sorted(set(known.get(name, ())) - counts.keys()):
                 yield f"{name} never reached ({len(missing)} of {len(known[name])}): {', '.join(missing)}"
 
 
-def everything() -> Mapping[str, set[str]]:
-    """All that there is, as the tables name it."""
+def everything(*, is_real: bool) -> Mapping[str, set[str]]:
+    """All that there is in that leg, as the tables name it."""
     own = [
         each.__name__ for _, each in inspect.getmembers(entries, inspect.isclass) if each.__module__ == entries.__name__
     ]
     return {
-        "kinds": {*KINDS, *ORDERS, "kill"},
+        "kinds": {"kill", *(REAL.keys() | FAULTS.keys() if is_real else KINDS.keys() | set(ORDERS))},
         "rules": {row.removeprefix(GUARD) for row in rows() if row.startswith(GUARD)},
         "events": {row for row in rows() if not row.startswith(GUARD)},
         "entries": set(own),

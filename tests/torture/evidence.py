@@ -8,7 +8,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,17 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from foundation.clock import seconds_ns
 from tests import forked
 from tests.torture.case import Case
 from tests.torture.laboratory import TRUTH
 from tests.torture.lives import COMPLETE, KILLED, ROOT, Life
+from tests.torture.real import KINDS as REAL
 
 ROW = np.dtype([("time_ns", "<i8"), *((name, "<f8") for name in TRUTH)])
 
 STEP_S = 0.5  # of the plant: what is switched or broken within a step acts from its begin on
+LATE_S = 3.0  # what is done in real time is done so much later at worst, on a busy machine
 GIVEN_UP = "segment_given_up"
 """The event of a file that a disk has refused: it stays unfinished, and is salvaged when the run has ended."""
 
@@ -68,7 +71,10 @@ class Exchange:
 @dataclass
 class Evidence:
     """frames: how often each (topic, instant) is there. metas: (instant, step id, flags) of the descriptions.
-    temperatures: (instant, degC, quality) by the thermometer's name. Instants are ns."""
+    temperatures: (instant, degC, quality) by the thermometer's name. Instants are ns. batch_ns: by how much the instant
+    of what was read together may be later than that of one reading."""
+
+    batch_ns = 0
 
     case: Case
     folder: Path
@@ -87,14 +93,20 @@ class Evidence:
         if self.is_complete and any(said.kind == GIVEN_UP for said in self.said):
             for found in (self.unreadable, self.said, self.marks, self.frames, self.metas, self.temperatures):
                 found.clear()
-            program = [sys.executable, "-m", "stand.cli", "session", "salvage", str(self.session)]
-            forked.run(program, cwd=ROOT, capture_output=True)
+            for session in self.sessions:
+                program = [sys.executable, "-m", "stand.cli", "session", "salvage", str(session)]
+                forked.run(program, cwd=ROOT, capture_output=True)
             self._read_all()
 
     def _read_all(self) -> None:
-        for path in sorted(self.session.glob("*/*.mcap*")):
+        for path in sorted(path for session in self.sessions for path in session.glob("*/*.mcap*")):
             if path.suffix in (".mcap", ".part"):
                 self._read(path)
+
+    @property
+    def sessions(self) -> list[Path]:
+        """All that the program has recorded."""
+        return [self.session]
 
     def at_s(self, time_ns: int) -> float:
         """An instant in s since the case's begin."""
@@ -231,3 +243,87 @@ class Evidence:
                     quality = kind.enum_type.values_by_number[getattr(message, kind.name)].name
                     row = (time_ns, value, quality)
                     self.temperatures.setdefault(described.name.removesuffix("_degC"), []).append(row)
+
+
+class RealEvidence(Evidence):
+    """Of a case in real time. Instants are those of the daemon that lived then; truth and wires have them, too."""
+
+    batch_ns = int(LATE_S * 1e9)
+
+    @cached_property
+    def truth(self) -> list[np.ndarray]:
+        """The plant while each daemon lived and before the next one, whichever laboratories that were."""
+        paths = sorted(self.folder.glob("truth-*.bin"), key=lambda path: int(path.stem.partition("-")[2]))
+        rows = [
+            np.frombuffer(data[: len(data) // ROW.itemsize * ROW.itemsize], ROW) for data in map(Path.read_bytes, paths)
+        ]
+        whole, found = np.concatenate(rows), list[np.ndarray]()
+        for begin_ns, end_ns, life in self._spans():
+            found.append(whole[(whole["time_ns"] >= begin_ns) & (whole["time_ns"] < end_ns)])
+            found[-1]["time_ns"] += life.offset_ns
+        return found
+
+    @cached_property
+    def bus(self) -> list[list[Exchange]]:
+        """As `truth`; what has armed the relay before a daemon began counts, too."""
+        count = len(list(self.folder.glob("wire-*.jsonl")))
+        whole = [each for number in range(count) for each in self._bus(number)]
+        before_ns = seconds_ns(self.hold_s + 2 * STEP_S)
+        return [
+            [
+                replace(each, time_ns=each.time_ns + life.offset_ns)
+                for each in whole
+                if begin_ns - before_ns <= each.time_ns < end_ns
+            ]
+            for begin_ns, end_ns, life in self._spans()
+        ]
+
+    @property
+    def sessions(self) -> list[Path]:
+        """The run's, and the records between runs."""
+        return sorted(path.parent for path in self.folder.glob("out/*/telemetry"))
+
+    def at_s(self, time_ns: int) -> float:
+        """An instant in s since the case's begin."""
+        begun = [life.offset_ns for life in self.lives if life.begun_ns + life.offset_ns <= time_ns]
+        return super().at_s(time_ns - (begun or [0])[-1])
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the run came to the plan's end, and the last daemon left as asked."""
+        ends = [entry["status"] for entry in self.journal if entry["entry"] == "Ended"]
+        return ends[-1:] == ["complete"] and self.lives[-1].status == COMPLETE
+
+    @property
+    def killed(self) -> int:
+        """Daemons, and processes that wrote for them."""
+        return super().killed + sum(order.verb == "disk_process_killed" for order in self.case.orders)
+
+    @property
+    def look_s(self) -> float:
+        """How far apart the guard's looks are, and how late they are on a busy machine."""
+        return super().look_s + LATE_S
+
+    def off_from_ns(self, life: int) -> int:
+        """From when on, after that life's end, everything is off."""
+        ended = self.lives[life]
+        return ended.ended_ns + ended.offset_ns + seconds_ns(self.hold_s + 2 * STEP_S)
+
+    def excused(self, at_s: float, *names: str, after_s: float = 0.0) -> bool:
+        """As for virtual time; what is as good as such a fault counts."""
+        return super().excused(at_s, *names, after_s=after_s) or any(
+            -STEP_S <= at_s - order.at_s <= order.body["for_s"] + LATE_S + after_s
+            for order in self.case.orders
+            if any(means.startswith(names) for means in REAL[order.verb].means)
+        )
+
+    def killed_soon(self, at_s: float, within_s: float) -> bool:
+        """As for virtual time; what wrote for the daemon counts."""
+        return super().killed_soon(at_s, within_s) or any(
+            order.verb == "disk_process_killed" and 0 <= order.at_s - at_s <= within_s for order in self.case.orders
+        )
+
+    def _spans(self) -> Iterator[tuple[int, int, Life]]:
+        """From when to when each daemon counts, in the laboratory's time: the first from the begin on."""
+        begins_ns = [0, *(life.begun_ns for life in self.lives[1:]), sys.maxsize]
+        yield from zip(begins_ns, begins_ns[1:], self.lives, strict=False)

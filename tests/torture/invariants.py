@@ -3,8 +3,10 @@ violation; `@invariant` enters it, and says of which leg it is: virtual time, re
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import json
+import math
 import re
 import sys
 from collections import Counter
@@ -29,6 +31,7 @@ DURABLE_S = 15.0  # what is younger may be lost by a kill
 LONGEST_GAP_S, PROBED_S = 30.0, 60.0  # between readings; of how long a device is not asked that was lost
 MOST_AN_HOUR = 6
 RELAYS_UNIT, TIMED_ON = 2, 0x0200
+STOP_S, TIMES_LATE = 1.0, 10.0  # as `python -m tests.bench stop` has it; of how late a thread beside was woken
 STATUSES = (COMPLETE, 1, 4, 130, KILLED)
 
 
@@ -204,6 +207,36 @@ def ends_are_safe(evidence: Evidence) -> Iterator[str]:
                 yield from _acting(evidence, truth, name, begin_ns, end_ns, f"the end with status {life.status}")
 
 
+@invariant(Leg.REAL)
+def heat_ends_with_the_program(evidence: Evidence) -> Iterator[str]:
+    """By the relay's timer, while the program is stopped; that of one which was killed is in `ends_are_safe`."""
+    for row in (row for doors in evidence.doors for row in doors if row["verb"] == "daemon_stopped"):
+        begin_ns = row["time_ns"] + int((evidence.hold_s + 2 * STEP_S) * 1e9)
+        for truth in evidence.truth:
+            end_ns = row["time_ns"] + int(row["body"]["for_s"] * 1e9)
+            yield from _acting(evidence, truth, "heater_enabled", begin_ns, end_ns, "a program that is stopped")
+
+
+@invariant(Leg.REAL)
+def a_stop_is_answered(evidence: Evidence) -> Iterator[str]:
+    """By a program that has its doors open and is neither stopped nor about to end."""
+    rows = [row for doors in evidence.doors for row in doors]
+    stops = [(evidence.at_s(row["time_ns"]), row["body"]["for_s"]) for row in rows if row["verb"] == "daemon_stopped"]
+    for row in (row for row in rows if row["verb"] == "stop_pressed"):
+        at_s, body = evidence.at_s(row["time_ns"]), row["body"]
+        begin_s, limit_s = at_s - body["took_s"], STOP_S + TIMES_LATE * body["late_s"]
+        is_open = any(
+            life.opened_ns
+            and life.opened_ns + life.offset_ns <= row["time_ns"] - int(body["took_s"] * 1e9)
+            and row["time_ns"] + int(10e9) <= life.ended_ns + life.offset_ns
+            for life in evidence.lives
+        )
+        is_stopped = any(stop_s - 1.0 <= at_s and begin_s <= stop_s + for_s + 1.0 for stop_s, for_s in stops)
+        if is_open and not is_stopped and body["took_s"] > limit_s:
+            late = f"a thread beside was {body['late_s']} s late"
+            yield f"a STOP by {body['way']} took {body['took_s']} s at {at_s} s, {late}"
+
+
 def _acting(evidence: Evidence, truth: np.ndarray, name: str, begin_ns: int, end_ns: int, when: str) -> Iterator[str]:
     """The first time at which this is on, or open, though what drives it can be reached."""
     drives = ("flap",) if name == "flap_open" else ("relays", "bus")
@@ -298,16 +331,20 @@ def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
     """A temperature that HTTP showed is in the recording, but for the last ones before a kill."""
     if not evidence.is_complete or any("lost" in said.kind or "dropped" in said.kind for said in evidence.said):
         return
-    recorded = {(name, row[0]): row[1] for name, rows in evidence.temperatures.items() for row in rows}
+    recorded = {name: sorted((row[0], row[1]) for row in rows) for name, rows in evidence.temperatures.items()}
     for row in (row for doors in evidence.doors for row in doors):
         readings = row["answer"].get("readings", {}) if isinstance(row["answer"], dict) else {}
         for channel, shown in readings.items():
             device, _, name = channel.partition(".")
             if device != "thermometers" or name not in evidence.temperatures or shown["quality"] != "good":
                 continue
-            at_s, value = evidence.at_s(shown["time_ns"]), recorded.get((name, shown["time_ns"]))
-            if (value is None or abs(value - shown["value"]) > 1e-6) and not evidence.killed_soon(at_s, DURABLE_S):
-                yield f"HTTP showed {channel} {shown['value']:.3f} of {at_s} s, the recording has {value}"
+            at_s, time_ns = evidence.at_s(shown["time_ns"]), shown["time_ns"]
+            first = bisect.bisect_left(recorded[name], (time_ns, -math.inf))
+            last = bisect.bisect_right(recorded[name], (time_ns + evidence.batch_ns, math.inf))
+            values = [value for _, value in recorded[name][first:last]]
+            is_there = any(abs(value - shown["value"]) < 1e-6 for value in values)
+            if not is_there and not evidence.killed_soon(at_s, DURABLE_S):
+                yield f"HTTP showed {channel} {shown['value']:.3f} of {at_s} s, the recording has {values}"
 
 
 @invariant(Leg.BOTH)
@@ -358,6 +395,12 @@ def ends_as_documented(evidence: Evidence) -> Iterator[str]:
             yield f"life {number} ended with status {life.status} and said nothing"
 
 
+@invariant(Leg.REAL)
+def nothing_is_left(evidence: Evidence) -> Iterator[str]:
+    """What the program has started ends with it."""
+    yield from evidence.lives[-1].left
+
+
 @invariant(Leg.BOTH)
 def is_completed_in_the_end(evidence: Evidence) -> Iterator[str]:
     """Faults end; a run that is resumed after them comes to its end."""
@@ -383,11 +426,12 @@ def _without_numbers(text: str) -> str:
 @invariant(Leg.BOTH)
 def nobody_is_pestered(evidence: Evidence) -> Iterator[str]:
     """No warning or error more than six times an hour."""
-    times: dict[tuple[str, str], list[int]] = {}
+    times: dict[tuple[str, str], set[int]] = {}  # what is said while a run begins is in two records
     for said in evidence.said:
         if said.level != "info":
-            times.setdefault((said.kind, _without_numbers(said.text)), []).append(said.time_ns)
-    for (kind, text), when in times.items():
+            times.setdefault((said.kind, _without_numbers(said.text)), set()).add(said.time_ns)
+    for (kind, text), instants in times.items():
+        when = sorted(instants)
         spans = [last - first for first, last in zip(when, when[MOST_AN_HOUR:], strict=False)]
         if spans and min(spans) < 3600e9:
             yield f"{kind} {MOST_AN_HOUR + 1} times in {min(spans) / 1e9:.0f} s: {text[:200]}"

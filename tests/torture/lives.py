@@ -26,12 +26,19 @@ KILLED, COMPLETE, BAD_INPUT = -9, 0, 2
 
 @dataclass(frozen=True, slots=True)
 class Life:
-    """command: what was asked. status: None for a program that hung and was killed."""
+    """command: what was asked. status: None for a program that hung and was killed. In real time also: when it was
+    begun, had opened its doors (0: never) and was gone, by the laboratory's clock, which its own is ahead of by
+    offset_ns; and the commands of the processes that were left when all was over."""
 
     command: list[str]
     status: int | None
     out: str
     err: str
+    begun_ns: int = 0
+    opened_ns: int = 0
+    ended_ns: int = 0
+    offset_ns: int = 0
+    left: tuple[str, ...] = ()
 
 
 def live(case: Case, folder: Path) -> list[Life]:

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.torture.case import Case, draw, smaller, steps_of
-from tests.torture.evidence import Evidence
+from tests.torture.evidence import Evidence, RealEvidence
 from tests.torture.invariants import Violation, violations
 from tests.torture.lives import Life, live
+from tests.torture.real import draw_real, live_real
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +41,9 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
     bytes again."""
     place = folder or Path(tempfile.mkdtemp(prefix="torture-"))
     try:
-        lives = live(case, place)
+        begun, lives = live_real(case, place) if case.is_real else (case, live(case, place))
         left = _digests(place)  # before the evidence, for which what is unfinished is salvaged
-        evidence = Evidence(case, place, lives)
+        evidence = (RealEvidence if case.is_real else Evidence)(begun, place, lives)
         spans_ns = [int(each["time_ns"][-1] - each["time_ns"][0]) for each in evidence.truth if len(each)]
         events = Counter(said.kind for said in evidence.said)
         trips = [said for said in evidence.said if said.kind.startswith("guard.") and "rule" in said.data]
@@ -71,9 +72,9 @@ def _digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def perform_seed(seed: int) -> Result:
-    """The case of a seed; each eighth twice."""
-    return perform(draw(seed), twice=seed % 8 == 0)
+def perform_seed(seed: int, *, is_real: bool = False) -> Result:
+    """The case of a seed; in virtual time each eighth twice."""
+    return perform(draw_real(seed)) if is_real else perform(draw(seed), twice=seed % 8 == 0)
 
 
 def shrunk(case: Case, rules: set[str], tries: int) -> Case:

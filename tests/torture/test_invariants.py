@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import copy
+import itertools
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from tests.torture.case import MOST_FAULTS, PLAIN, Case, Fault, Order, draw, rea
 from tests.torture.evidence import Evidence, Said
 from tests.torture.invariants import INVARIANTS, RELAYS_UNIT, violations
 from tests.torture.lives import live
+from tests.torture.real import draw_real
 from tests.torture.rig import shrunk
 
 QUIET = {
@@ -72,8 +76,20 @@ def hold(evidence: Evidence) -> None:
     changed(evidence, "heater_enabled", 1.0)
 
 
-def end(evidence: Evidence, status: int | None) -> None:
-    evidence.lives = [*evidence.lives[:-1], replace(evidence.lives[-1], status=status)]
+def end(evidence: Evidence, **how: Any) -> None:
+    evidence.lives = [*evidence.lives[:-1], replace(evidence.lives[-1], **how)]
+
+
+def stop_program(evidence: Evidence) -> None:
+    body = {"for_s": 200.0}
+    evidence.doors[0].append({"time_ns": middle_ns(evidence), "verb": "daemon_stopped", "body": body, "answer": None})
+    changed(evidence, "heater_enabled", 1.0)
+
+
+def press_stop(evidence: Evidence) -> None:
+    body = {"way": "TCP", "took_s": 5.0, "late_s": 0.1}
+    evidence.doors[0].append({"time_ns": middle_ns(evidence), "verb": "stop_pressed", "body": body, "answer": True})
+    end(evidence, opened_ns=1, ended_ns=sys.maxsize)
 
 
 def fail_thrice(evidence: Evidence) -> None:
@@ -111,10 +127,13 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "http_says_what_is_recorded": misread,
     "readings_go_on": lambda evidence: evidence.temperatures["air"].__delitem__(slice(50, 80)),
     "verify_finds_what_is_lost_and_nothing_else": lambda evidence: evidence.frames.popitem(),
-    "ends_as_documented": lambda evidence: end(evidence, 77),
-    "is_completed_in_the_end": lambda evidence: end(evidence, 1),
+    "ends_as_documented": lambda evidence: end(evidence, status=77),
+    "is_completed_in_the_end": lambda evidence: end(evidence, status=1),
     "is_told_what_to_mend": fail_thrice,
     "nobody_is_pestered": pester,
+    "heat_ends_with_the_program": stop_program,
+    "a_stop_is_answered": press_stop,
+    "nothing_is_left": lambda evidence: end(evidence, left=("python -m foundation.helper",)),
 }
 """For each invariant what is changed in the evidence, so that it must be found."""
 
@@ -134,9 +153,9 @@ def test_an_invariant_finds_what_it_forbids(quiet: Evidence, name: str):
 
 
 def test_a_seed_draws_the_same_case_and_a_case_is_read_as_it_was_written(tmp_path: Path):
-    for seed in range(40):
-        case = draw(seed)
-        assert case == draw(seed)
+    for seed, draws in itertools.product(range(40), (draw, draw_real)):
+        case = draws(seed)
+        assert case == draws(seed)
         assert len(case.faults) <= MOST_FAULTS
         (path := tmp_path / "case.yaml").write_text(write_case(case))
         assert read_case(path) == case
