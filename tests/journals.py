@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
-from recording.reading.journal_lines import lines_of
-from stand.running.memory.entries import Written, decoded
+from collections.abc import Iterable
+
+from recording.reading.journal_lines import journal_lines, lines_of, mark_of
+from stand.running.memory.entries import Written, decoded, encoded
+
+MARK = mark_of("a session")
+
+
+def lines_with(entries: Iterable[Written], place: int = 0, mark: bytes = MARK) -> bytes:
+    """The lines of a journal, from that place of the file on."""
+    return journal_lines(map(encoded, entries), mark, place)
 
 
 def read_lines(data: bytes) -> tuple[list[Written], int]:

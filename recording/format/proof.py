@@ -1,7 +1,7 @@
 """Whether the bytes of one record prove that they are what the writer wrote.
 
 A chunk and an attachment prove themselves by their CRC (our writer always makes one, so a CRC of 0 is a CRC), the
-records without one by being, byte for byte, what the writer makes of what they say.
+records without one by being, byte for byte, what the writer makes of what they say; a message index by its chunk.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, DataEnd, Header, MessageIndex, Metadata, Schema
 
 from recording.format.mcap_bytes import (
     MESSAGE,
@@ -27,11 +27,16 @@ from recording.format.mcap_bytes import (
 
 
 class Contents(NamedTuple):
-    """What a chunk holds."""
+    """What a chunk holds. places: log time and offset of each message, by channel."""
 
     schemas: list[Schema]
     channels: list[Channel]
     messages: Counter[int]
+    places: dict[int, list[tuple[int, int]]]
+
+    def indexes(self) -> set[bytes]:
+        """What the message indexes behind the chunk say."""
+        return {bytes_of(MessageIndex(*each))[RECORD.size :] for each in self.places.items()}
 
 
 class Claim(NamedTuple):
@@ -85,15 +90,17 @@ def _is_text(record: Header | Metadata | DataEnd) -> bool:
 
 
 def _contents(data: memoryview) -> Contents:
-    contents = Contents([], [], Counter())
+    contents, offset = Contents([], [], Counter(), {}), 0
     for opcode, record in records(data):
         if opcode == Opcode.MESSAGE:
-            channel, *_ = MESSAGE.unpack_from(record)
+            channel, _, time_ns, _ = MESSAGE.unpack_from(record)
             contents.messages[channel] += 1
+            contents.places.setdefault(channel, []).append((time_ns, offset))
         elif opcode == Opcode.SCHEMA:
             contents.schemas.append(Schema.read(stream(record)))
         elif opcode == Opcode.CHANNEL:
             contents.channels.append(Channel.read(stream(record)))
         else:
             raise ValueError(f"a chunk holds a record of kind {opcode}")
+        offset += RECORD.size + len(record)
     return contents

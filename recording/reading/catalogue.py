@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 INDEX_NAME = ".sessions.sqlite"
 DELETED = ".deleted"  # of a folder that is being deleted, behind a dot and its name
-_VERSION = 2  # of the index; the program's version counts, too, for what it says of a session
+_VERSION = 3  # of the index; the program's version counts, too, for what it says of a session
 _BUSY_S = 1.0  # how long another one that writes the index is waited for
-_SCHEMA = "CREATE TABLE sessions (name BLOB PRIMARY KEY, files TEXT NOT NULL, entry TEXT NOT NULL)"
+_SCHEMA = "CREATE TABLE sessions (name BLOB PRIMARY KEY, sealed TEXT NOT NULL, entry TEXT NOT NULL)"
 _File = tuple[str, int, int, bool]  # name, size, time of its last change in ns, whether a recorder has it open
 _INSTANT, _TEXT = (int, type(None)), (str,)
 _KINDS: dict[str, tuple[type, ...]] = {
@@ -228,8 +228,9 @@ class _Index:
         """What was entered of these files; None when nothing was."""
         if self._memory is not None and (seen := self._memory.get(path)) is not None and seen[0] == files:
             return seen[1]
-        found = self._rows.get(os.fsencode(path.name))
-        if found is None or found[0] != files:
+        name = os.fsencode(path.name)
+        found = self._rows.get(name)
+        if found is None or found[0] != self._seal(name, files, found[1]):
             return None
         try:
             return _decoded(path, found[1])
@@ -263,7 +264,7 @@ class _Index:
                 if not opened.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
                     opened.execute(_SCHEMA)
                 opened.executemany("DELETE FROM sessions WHERE name = ?", [(name,) for name in self._gone])
-                rows = [(name, self._tagged(files), text) for name, (files, text) in self._new.items()]
+                rows = [(name, self._seal(name, files, text), text) for name, (files, text) in self._new.items()]
                 opened.executemany("INSERT OR REPLACE INTO sessions VALUES (?, ?, ?)", rows)
 
     def _opened(self) -> sqlite3.Connection:
@@ -282,16 +283,16 @@ class _Index:
             tables = opened.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
             if tables != [(_SCHEMA,)]:
                 return {}
-            rows = opened.execute("SELECT name, files, entry FROM sessions").fetchall()
-        mark = self._tagged("")
+            rows = opened.execute("SELECT name, sealed, entry FROM sessions").fetchall()
         return {
-            name: (files.removeprefix(mark), text)
-            for name, files, text in rows
-            if isinstance(name, bytes) and isinstance(text, str) and str(files).startswith(mark)
+            name: (str(sealed), text)
+            for name, sealed, text in rows
+            if isinstance(name, bytes) and isinstance(text, str)
         }
 
-    def _tagged(self, files: str) -> str:
-        return f"{self._version}: {files}"
+    def _seal(self, name: bytes, files: str, text: str) -> str:
+        """What a row was made by, of which files, and all that it says: the database itself has no checksums."""
+        return _digest((self._version, name, files, text))
 
 
 def _encoded(entry: Entry) -> str:

@@ -30,6 +30,7 @@ from recording.reading.ends import is_of_a_run, lost_end
 from recording.reading.extent import extent_of
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
 from recording.reading.kept_originals import is_recovered
+from recording.reading.notes import NOTES_NAME, read_notes
 from recording.reading.run_word import Files, Run, run_word
 from recording.reading.session import Session
 from recording.reading.temperature_present import NO_TEMPERATURE, has_recorded_temperature
@@ -140,6 +141,8 @@ def glance(path: Path) -> Glance:
     troubles += [*_misfits(seen, metadata), *_kept(files, seen)]
     if journal is not None and journal.damage and extent is None:
         troubles.append(f"{JOURNAL_NAME}: {journal.damage}")
+    if damage := read_notes(path).damage:
+        troubles.append(f"{NOTES_NAME}: {damage}")
     missing = [*_missing(coverage), *(() if extent else _lost_end(coverage, near, journal, utc))]
     if not troubles and not missing:
         troubles, missing = _frames_held_against_descriptions(path, seen, coverage)

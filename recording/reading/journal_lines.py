@@ -1,12 +1,15 @@
-"""The lines of a run's journal, `journal.jsonl`: the CRC-32 of the rest in 8 hex digits, a space, a JSON object.
+"""The lines of a run's journal, `journal.jsonl`: a CRC-32 and the file's mark in 8 hex digits each, then a JSON object.
 
-A line that has its end but does not fit its CRC is damaged; the lines after it count all the same. What has no end of
-line was never acknowledged.
+The CRC is of the line's place in the file, the mark and the JSON: a line that the disk has put into another place, or
+into another session's journal, does not fit. A line that has its end but does not fit its CRC, or has another mark than
+most, is damaged; the lines after it count all the same. What has no end of line was never acknowledged, or is lost.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,33 +22,53 @@ LIMIT_BYTES = 32_000_000  # an entry a minute for 200 days; all of them are in m
 @dataclass(frozen=True, slots=True)
 class Lines:
     """sound: the JSON of each sound line. damaged: numbers of the damaged lines, from 1, and `of` how many lines there
-    are. size_bytes: up to the end of the last sound line."""
+    are. size_bytes: up to the end of the last sound line. mark: the file's, b"" when no line has one. unended_bytes:
+    behind the last end of a line."""
 
     sound: tuple[bytes, ...]
     damaged: tuple[int, ...]
     of: int
     size_bytes: int
+    mark: bytes
+    unended_bytes: int
 
 
-def journal_line(text: bytes) -> bytes:
-    """A JSON text as a line."""
-    return b"%08x %s\n" % (zlib.crc32(text), text)
+def mark_of(name: str) -> bytes:
+    """Of a new file in the session of that name; copies and renamed sessions keep what they have."""
+    return b"%08x" % zlib.crc32(name.encode(errors="surrogateescape"))
+
+
+def journal_lines(texts: Iterable[bytes], mark: bytes, place: int = 0) -> bytes:
+    """JSON texts as lines, of which the first begins at that place of the file."""
+    found = bytearray()
+    for text in texts:
+        marked = b"%s %s" % (mark, text)
+        found += b"%s%s\n" % (_crc(marked, place + len(found)), marked)
+    return bytes(found)
 
 
 def lines_of(data: bytes) -> Lines:
     """What is sound of a journal, and what is not."""
-    sound: list[bytes] = []
-    damaged: list[int] = []
-    number = size_bytes = place = 0
-    for number, line in enumerate(data.split(b"\n")[:-1], 1):  # what has no end of line is no line
+    *lines, unended = data.split(b"\n")  # what has no end of line is no line
+    found = [b""] * len(lines)  # of each line, mark and JSON where it fits its CRC
+    ends: list[int] = []
+    place = 0
+    for number, line in enumerate(lines):
+        if line[:9] == _crc(line[9:], place):
+            found[number] = line[9:]
         place += len(line) + 1
-        crc, _, text = line.partition(b" ")
-        if crc == b"%08x" % zlib.crc32(text):
-            sound.append(text)
-            size_bytes = place
-        else:
-            damaged.append(number)
-    return Lines(tuple(sound), tuple(damaged), number, size_bytes)
+        ends.append(place)
+    marks = Counter(marked[:8] for marked in found if marked)
+    mark = marks.most_common(1)[0][0] if marks else b""
+    texts = [marked[9:] if marked[:8] == mark else b"" for marked in found]
+    size_bytes = max((end for end, text in zip(ends, texts, strict=True) if text), default=0)
+    damaged = tuple(number for number, text in enumerate(texts, 1) if not text)
+    return Lines(tuple(filter(None, texts)), damaged, len(lines), size_bytes, mark, len(unended))
+
+
+def _crc(marked: bytes, place: int) -> bytes:
+    """With the space behind it."""
+    return b"%08x " % zlib.crc32(marked, place)
 
 
 def damage_text(lines: Lines) -> str:
@@ -55,13 +78,18 @@ def damage_text(lines: Lines) -> str:
     return f"{first}{more} of {lines.of} {'are' if more else 'is'} damaged; the lines after it count"
 
 
+def unended_text(unended_bytes: int) -> str:
+    """What is behind the last end of a line, as the part of a sentence."""
+    return f"the last {unended_bytes} bytes are no line: one was being written, or is lost"
+
+
 @dataclass(frozen=True, slots=True)
 class JournalFacts:
     """What a journal says of its run, to be compared with the recording.
 
     last_ns: instant of its last entry. status, ended_ns: how and when the run ended, "" and 0 when the last entry does
     not say. done: ids of the steps that are done, which were on the disk then. damage: what is wrong with the file,
-    "" when nothing is.
+    "" when nothing is. unended: what is no line at its end, "" when nothing is.
     """
 
     last_ns: int = 0
@@ -70,6 +98,7 @@ class JournalFacts:
     resumed_ns: int = 0
     done: frozenset[str] = frozenset()
     damage: str = ""
+    unended: str = ""
 
 
 def journal_facts(directory: Path) -> JournalFacts | None:
@@ -98,6 +127,7 @@ def journal_facts(directory: Path) -> JournalFacts | None:
         max((_instant(entry.get("time_ns")) for entry in entries if entry.get("entry") == "Gap"), default=0),
         frozenset(step_id for step_id in done if isinstance(step_id, str)),
         damage_text(lines) if lines.damaged else "",
+        unended_text(lines.unended_bytes) if lines.unended_bytes else "",
     )
 
 

@@ -1,7 +1,7 @@
 """What people say of a session: notes and tags, and where it was archived, in a small file of its own, `notes.jsonl`.
 
 Lines are only ever added, each with who and when, in the form of the journal's: a CRC, then a JSON object. So a running
-session takes a note, too, and its recording is not touched. A line that was torn or damaged is left out.
+session takes a note, too, and its recording is not touched. A line that was torn or damaged is left out, and said.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ import re
 import stat
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import cast
 
 from foundation.errors import ConfigError, SessionError
 from foundation.json_values import json_object
-from recording.reading.journal_lines import journal_line, lines_of
+from recording.reading.journal_lines import damage_text, journal_lines, lines_of, mark_of, unended_text
 
 NOTES_NAME = "notes.jsonl"
 LONGEST_NOTE = 4000  # characters
 LIMIT_BYTES = 4_000_000
 TAG = re.compile(r"[^\W_][\w.:+-]{0,39}")
+_HEAD_BYTES = 20  # of a line, with its end
 _APPENDING = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _NOTE, _TAGS, _UNTAG, _ARCHIVED = "note", "tags", "untag", "archived"
 
@@ -49,11 +50,14 @@ class Archived:
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """All that was said; `tags` in the order they were given first."""
+    """All that was said; `tags` in the order they were given first. damage, unended: what is lost of it, and what is no
+    line at its end, which was being written or is lost; "" when nothing is."""
 
     notes: tuple[Note, ...] = ()
     tags: tuple[str, ...] = ()
     archived: tuple[Archived, ...] = ()
+    damage: str = ""
+    unended: str = ""
 
     def as_json(self) -> dict[str, object]:
         """Fields for programs."""
@@ -72,8 +76,10 @@ def read_notes(directory: Path) -> Notes:
         return Notes()
     finally:
         os.close(fd)
-    found = lines_of(data).sound
-    return _folded(entry for line in found if (entry := json_object(line)) is not None)
+    lines = lines_of(data)
+    found = _folded(entry for line in lines.sound if (entry := json_object(line)) is not None)
+    damage = damage_text(lines) if lines.damaged else ""
+    return replace(found, damage=damage, unended=unended_text(lines.unended_bytes) if lines.unended_bytes else "")
 
 
 def add_note(directory: Path, text: str, by: str, time_ns: int) -> None:
@@ -106,13 +112,13 @@ def check_tag(tag: str) -> str:
 
 
 def _append(directory: Path, fields: Mapping[str, object]) -> None:
-    """One line, behind whatever is there; the end of a line that was torn stays apart from it.
+    """One line, behind the last one; what was torn behind that is cut off.
 
     The folder is opened first and not through a symbolic link, so that nothing is ever written elsewhere. What the disk
     took of a line that it did not take whole is cut off again.
     """
     path = directory / NOTES_NAME
-    line = journal_line(json.dumps(fields, ensure_ascii=False).encode(errors="replace"))
+    text = json.dumps(fields, ensure_ascii=False).encode(errors="replace")
     try:
         with ExitStack() as opened:
             folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
@@ -121,10 +127,12 @@ def _append(directory: Path, fields: Mapping[str, object]) -> None:
             opened.callback(os.close, fd)
             fcntl.flock(fd, fcntl.LOCK_EX)
             status = os.fstat(fd)
-            if not stat.S_ISREG(status.st_mode) or status.st_size + len(line) > LIMIT_BYTES:
+            if not stat.S_ISREG(status.st_mode) or status.st_size + len(text) + _HEAD_BYTES > LIMIT_BYTES:
                 raise SessionError(f"{path}: is no file of notes, or is full")
-            torn = status.st_size and os.pread(fd, 1, status.st_size - 1) != b"\n"
-            _write_whole(fd, b"\n" + line if torn else line, status.st_size)
+            lines, end = lines_of(os.pread(fd, LIMIT_BYTES, 0)), status.st_size
+            end -= lines.unended_bytes
+            os.ftruncate(fd, end)
+            _write_whole(fd, journal_lines((text,), lines.mark or mark_of(directory.absolute().name), end), end)
             os.fsync(fd)
             os.fsync(folder)  # the file may be new
     except OSError as error:

@@ -3,6 +3,7 @@
 Read by place from the front; what counts as a proof is in recording/format/proof.py, what as a block that was being
 written in recording/reading/torn.py. Behind a damaged place the walk continues at the next bytes that look like a
 record and prove to be one. Inside sound records nothing is searched, so an MCAP file that is attached is an attachment.
+Chunks that a disk has put into the wrong place count as damage (recording/reading/misplaced.py).
 
 Memory is flat: one record at a time. Only OSError is raised, when the disk does not give a byte.
 """
@@ -23,10 +24,20 @@ from mcap.writer import MCAP0_MAGIC
 
 from recording.format.damage import DAMAGE
 from recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
-from recording.format.mcap_bytes import MESSAGE, RECORD, Source, chunk_content, chunk_head, records, stream
+from recording.format.mcap_bytes import (
+    MESSAGE,
+    RECORD,
+    ChunkHead,
+    Source,
+    chunk_content,
+    chunk_head,
+    records,
+    stream,
+)
 from recording.format.proof import Contents, claim_of, proven
 from recording.format.summary import read_summary
 from recording.reading.doubt import Doubt
+from recording.reading.misplaced import PlacedChunk, Span, misplaced
 from recording.reading.torn import Blocks
 
 WINDOW_BYTES = 4 << 20
@@ -49,13 +60,6 @@ class SoundChunk(NamedTuple):
 
     offset: int
     length: int
-
-
-class UnprovenBytes(NamedTuple):
-    """Bytes [begin, end) that prove nothing."""
-
-    begin: int
-    end: int
 
 
 class StoredMessage(NamedTuple):
@@ -85,7 +89,7 @@ class Survey:
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     chunks: list[SoundChunk] = field(default_factory=list[SoundChunk])
     messages: Counter[int] = field(default_factory=Counter[int])
-    damages: list[UnprovenBytes] = field(default_factory=list[UnprovenBytes])
+    damages: list[Span] = field(default_factory=list[Span])
     torn_bytes: int = 0
     is_opening_whole: bool = False
 
@@ -119,11 +123,12 @@ def stored_messages(source: Source, place: SoundChunk) -> Iterator[StoredMessage
 
 
 class _Proven(NamedTuple):
-    """A record that proved itself; `content` where it matters to the survey."""
+    """A record that proved itself; `content` where it matters to the survey, `chunk` of a chunk."""
 
     begin: int
     end: int
     content: Contents | Metadata | Attachment | DataEnd | None
+    chunk: ChunkHead | None = None
 
 
 class _Walk:
@@ -137,6 +142,8 @@ class _Walk:
         self._blocks = Blocks()
         self._index_begin: int | None = None
         self._sound_attachments: dict[str, Attachment] = {}  # those before the first damage
+        self._placed: list[PlacedChunk] = []
+        self._indexes: set[bytes] = set()  # those that belong behind the last chunk
 
     def run(self, to_first_chunk: bool) -> None:
         offset = 0
@@ -144,7 +151,7 @@ class _Walk:
             record = self._record_at(offset)
             if record is None:
                 record = self._next_record(offset)
-                self._note_gap(UnprovenBytes(offset, record.begin if record else self._source.size))
+                self._note_gap(Span(offset, record.begin if record else self._source.size))
                 if record is None:
                     break
             self._take(record)
@@ -154,6 +161,21 @@ class _Walk:
                 break
         if not self.found.chunks:
             self.found.is_opening_whole = self.found.session is not None and not self.found.damages
+        self._forget_misplaced()
+
+    def _forget_misplaced(self) -> None:
+        found, size = self.found, self._source.size
+        torn = [Span(size - found.torn_bytes, size)] if found.torn_bytes else []
+        for wrong in misplaced(self._placed, [*found.damages, *torn]):
+            for chunk in self._placed:
+                if wrong.begin <= chunk.begin < wrong.end:
+                    found.messages = found.messages - chunk.messages
+            found.chunks = [chunk for chunk in found.chunks if not wrong.begin <= chunk.offset < wrong.end]
+            begin = min([wrong.begin, *(gap.begin for gap in found.damages if wrong.begin <= gap.end <= wrong.end)])
+            found.damages = [gap for gap in found.damages if not begin <= gap.begin < wrong.end]
+            found.damages.append(Span(begin, wrong.end))
+            found.damages.sort()
+            found.torn_bytes = 0 if wrong.end == size else found.torn_bytes
 
     def _record_at(self, offset: int) -> _Proven | None:
         """The record that begins there, None when nothing there proves itself."""
@@ -170,13 +192,16 @@ class _Walk:
             if not self._doubt.can_be_true(offset, claim, chunk):
                 return None
             cost_bytes = max(claim.length, chunk.size_bytes if chunk else 0)
-            content = proven(claim.opcode, self._source.read(offset + RECORD.size, claim.length))
+            data = self._source.read(offset + RECORD.size, claim.length)
+            content = proven(claim.opcode, data)
+            if claim.opcode == Opcode.MESSAGE_INDEX and data not in self._indexes:
+                raise ValueError("a message index is not that of its chunk")
         except DAMAGE as error:
             if isinstance(error, OSError):
                 raise
             self._doubt.note_false(cost_bytes)
             return None
-        return _Proven(offset, offset + RECORD.size + claim.length, content)
+        return _Proven(offset, offset + RECORD.size + claim.length, content, chunk)
 
     def _next_record(self, offset: int) -> _Proven | None:
         """The first sound record behind the damaged one at `offset`."""
@@ -195,7 +220,7 @@ class _Walk:
                     yield window + match.start()
             window += WINDOW_BYTES
 
-    def _note_gap(self, gap: UnprovenBytes) -> None:
+    def _note_gap(self, gap: Span) -> None:
         if gap.begin == self._index_begin and gap.end == self._source.size:
             return
         if gap.end == self._source.size and self._blocks.is_torn(self._source, gap.begin):
@@ -208,12 +233,15 @@ class _Walk:
     def _take(self, record: _Proven) -> None:
         found = self.found
         match record.content:
-            case Contents(schemas, channels, messages):
+            case Contents(schemas, channels, messages) as contents:
+                self._indexes = contents.indexes()
                 if not found.chunks:
                     found.is_opening_whole = found.session is not None and not found.damages
                 found.schemas.update({schema.id: schema for schema in schemas})
                 found.channels.update({channel.id: channel for channel in channels})
                 found.messages.update(messages)
+                if record.chunk is not None:
+                    self._placed.append(PlacedChunk(record.begin, record.chunk, messages))
                 self._blocks.note(record.begin, record.end, messages)
                 found.chunks.append(SoundChunk(record.begin + RECORD.size, record.end - record.begin - RECORD.size))
             case Metadata(name=name, metadata=entries) if name == SESSION_METADATA:
@@ -234,7 +262,7 @@ class _Walk:
         """The session's metadata stands before the first chunk: the chunks so far lay in a damaged attachment."""
         self.found.attachments = dict(self._sound_attachments)
         self.found.schemas, self.found.channels = {}, {}
-        self.found.chunks, self.found.messages = [], Counter()
+        self.found.chunks, self.found.messages, self._placed = [], Counter(), []
 
     def _take_index(self, begin: int) -> bool:
         """Learn from the index at `begin` when all of it is sound, to the end of the file."""

@@ -37,6 +37,7 @@ from recording.reading.frame_account import frame_account
 from recording.reading.gaps import FRAMES_DROPPED, reported_blocks, silences
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
 from recording.reading.kept_originals import is_recovered
+from recording.reading.notes import NOTES_NAME, Notes, read_notes
 from recording.reading.run_word import Files, Run, run_word
 from recording.reading.temperature_present import NO_TEMPERATURE, has_temperature
 from recording.repair.segment_check import Damage, SegmentCheck, check_segment
@@ -170,7 +171,8 @@ def verify(path: Path, report: Callable[[float, str], None] = no_report) -> Veri
         *_missing(coverage, utc),
         *_damaged(read),
         *_metadata(finished, read),
-        *(() if extent else _journal_and_end(read.contents, coverage, journal, utc)),
+        *(() if extent else _journal_and_end(read, coverage, journal, utc)),
+        *_notes(read_notes(path)),
         *_frames_against_descriptions(read, coverage),
         *_frames_lost(read.contents),
         *_silences(read.contents),
@@ -257,20 +259,37 @@ def _are_missing(hole: Hole, utc: UtcOffsets) -> str:
 
 
 def _journal_and_end(
-    contents: Contents, coverage: Coverage, journal: JournalFacts | None, utc: UtcOffsets
+    read: _Read, coverage: Coverage, journal: JournalFacts | None, utc: UtcOffsets
 ) -> Iterator[Finding]:
-    """The journal by itself, and what it says that is not in the recording."""
+    """The journal by itself, and what it says that is not in the recording, nor in what is damaged of it."""
+    contents = read.contents
     if journal is None and is_of_a_run(contents.events, contents.marks):
         yield _missing_part("is missing; what the recording itself says of the run counts", JOURNAL_NAME)
     if journal is not None and journal.damage:
         yield _error(journal.damage, JOURNAL_NAME)
-    has_gap = any(hole.series == TELEMETRY for hole in coverage.holes) or any(
-        missing_segments(TELEMETRY, (file.number for file in coverage.files if file.series == TELEMETRY), ())
+    if journal is not None and journal.unended:
+        yield _note(journal.unended, JOURNAL_NAME)
+    telemetry = [file for file in coverage.files if file.series == TELEMETRY]
+    damaged = {name for name, check in read.checks.items() if check.damages}
+    if telemetry and telemetry[-1].name in damaged:
+        return
+    has_gap = (
+        any(hole.series == TELEMETRY for hole in coverage.holes)
+        or any(file.name in damaged or file.state is State.UNFINISHED for file in telemetry)
+        or any(missing_segments(TELEMETRY, (file.number for file in telemetry), ()))
     )
     lost = lost_end(coverage, contents.events, () if has_gap else contents.marks, journal, utc)
     if lost is not None and lost.hole.first is not None:
         where = segments_text(TELEMETRY, lost.hole.first, None).partition(" ")[0]
         yield _missing_part(f"is missing, with all that followed: {lost.why}", where)
+
+
+def _notes(said: Notes) -> Iterator[Finding]:
+    """What people said of the session."""
+    if said.damage:
+        yield _error(said.damage, NOTES_NAME)
+    if said.unended:
+        yield _note(said.unended, NOTES_NAME)
 
 
 def _damaged(read: _Read) -> Iterator[Finding]:

@@ -187,7 +187,8 @@ def remove_idle_logs(directory: Path, today: str, days: int) -> list[str]:
             continue
         with suppress(SessionError, OSError, LookupError, ValueError):
             kept = read_notes(path)
-            if Session.open(path).metadata["recipe"] == BETWEEN_RUNS and not kept.notes and not kept.tags:
+            is_kept = kept.notes or kept.tags or kept.damage or kept.unended  # what is lost may be a tag
+            if Session.open(path).metadata["recipe"] == BETWEEN_RUNS and not is_kept:
                 gone = path.with_name(f".{path.name}{DELETED}")  # a reader never sees half of one
                 path.rename(gone)
                 shutil.rmtree(gone)

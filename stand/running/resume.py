@@ -118,7 +118,7 @@ def _interruption(
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
     begun = first if isinstance(first, Begun) else _recorded_begun(session)
-    lost = _recorded_end(session, entries) if journal.damage else ()  # what else is lost is unknown
+    lost = _recorded_end(session, entries)
     items = (*session.steps(), *session.events())
     all_entries = (*with_recorded(entries, items, _recorded_frames(session)), *lost)
     _check_may_go_on(directory, folded((), all_entries), clear)
@@ -188,7 +188,8 @@ def _recorded_frames(session: Session) -> list[tuple[int, str]]:
 
 
 def _recorded_end(session: Session, entries: Sequence[Entry]) -> tuple[Entry, ...]:
-    """The end of the run by the recording, when its journal has lost that."""
+    """The end of the run by the recording, when its journal has lost that: it says so in damaged lines, or not at all
+    when it is the last flush that the disk has lost."""
     event = last_run_event(session.events())
     if isinstance(entries[-1], Ended) or event is None or event.kind != RUN_END or event.time_ns < entries[-1].time_ns:
         return ()

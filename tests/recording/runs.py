@@ -4,7 +4,7 @@ import json
 
 from foundation.clock import NS_PER_S
 from foundation.items import Event, StepMark, StepState
-from recording.reading.journal_lines import JOURNAL_NAME, journal_line
+from recording.reading.journal_lines import JOURNAL_NAME, journal_lines, mark_of
 
 from .recorded import START_NS, half_second, record
 
@@ -60,7 +60,7 @@ def entries(seconds=SECONDS, status="complete"):
 
 def write_journal(directory, *found):
     """The journal of a session's folder."""
-    data = b"".join(journal_line(json.dumps(entry).encode()) for entry in found)
+    data = journal_lines((json.dumps(entry).encode() for entry in found), mark_of(directory.name))
     (directory / JOURNAL_NAME).write_bytes(data)
     return directory / JOURNAL_NAME
 

@@ -105,3 +105,25 @@ def test_notes_given_at_once_are_all_kept(tmp_path: Path):
     with ThreadPool(8) as pool:
         pool.map(lambda number: add_note(tmp_path, f"note {number}", "eva", number), range(40))
     assert sorted(note.time_ns for note in read_notes(tmp_path).notes) == list(range(40))
+
+
+def test_what_is_damaged_of_the_notes_is_named_and_nothing_is_written_behind_what_is_torn(tmp_path: Path):
+    for number in range(3):
+        add_note(tmp_path, f"note {number}", "eva", number)
+    path = tmp_path / NOTES_NAME
+    whole = path.read_bytes()
+    first, second, third = whole.splitlines(keepends=True)
+    path.write_bytes(third + second + first)  # each sound, and two of them not of their place
+    assert read_notes(tmp_path).damage.startswith("line 1 and 1 more of 3 are damaged")
+    assert [note.text for note in read_notes(tmp_path).notes] == ["note 1"]
+    path.write_bytes(whole[:-4])
+    said = read_notes(tmp_path)
+    assert (len(said.notes), said.damage) == (2, "")
+    assert f"the last {len(third) - 4} bytes are no line" in said.unended
+    add_note(tmp_path, "note 2", "eva", 2)
+    assert path.read_bytes() == whole
+    other = tmp_path / "renamed"
+    other.mkdir()
+    (other / NOTES_NAME).write_bytes(whole)
+    add_note(other, "more", "eva", 3)
+    assert (len(read_notes(other).notes), read_notes(other).damage) == (4, "")

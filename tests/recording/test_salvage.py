@@ -45,6 +45,25 @@ def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, serie
         assert done.kept is None or done.kept.read_bytes() == data
 
 
+@pytest.mark.parametrize("trials", TRIALS)
+@pytest.mark.parametrize("sector_bytes", [512, 4096])
+@pytest.mark.parametrize("earlier", [False, True])
+def test_a_sector_that_belongs_elsewhere_adds_nothing(damaged, night, earlier, sector_bytes, trials):
+    """It holds whole chunks with right CRCs: of this segment, or of a minute before."""
+    rng, part = random.Random(f"{earlier} {sector_bytes}"), night[1][TELEMETRY, "part"].data
+    source = night[1][TELEMETRY, "finished"].data if earlier else part
+    for _ in range(trials):
+        begin, to = (rng.randrange(sector_bytes, len(part) - sector_bytes, sector_bytes) for _ in range(2))
+        begin = min(begin, to) if earlier else begin
+        sector = source[begin : begin + sector_bytes]
+        folder, path, written = damaged(
+            TELEMETRY, lambda data, at=to, new=sector: data[:at] + new + data[at + len(new) :]
+        )
+        data = path.read_bytes()
+        (done,) = salvage_session(folder.parent)
+        assert read_segment(done.path) == written.untouched(data), f"{begin} to {to}"
+
+
 @pytest.mark.parametrize("trials", [8, by_night(300)])
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)

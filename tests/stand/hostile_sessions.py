@@ -23,6 +23,7 @@ from recording.format import messages
 from recording.format.images import CAMERA_IMAGE
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
+from recording.reading.journal_lines import journal_lines, lines_of
 
 SOUND, INCOMPLETE, DAMAGED, UNKNOWN, NONE = "sound", "incomplete", "damaged", "unknown", ""
 GB = 1 << 30
@@ -90,8 +91,8 @@ def listening(path: Path) -> None:
 
 def journal(session: Path, *lines: bytes) -> None:
     """Lines with the right CRC behind those of the run."""
-    with (session / "journal.jsonl").open("ab") as file:
-        file.writelines(b"%08x %s\n" % (zlib.crc32(line), line) for line in lines)
+    data = (session / "journal.jsonl").read_bytes()
+    (session / "journal.jsonl").write_bytes(data + journal_lines(lines, lines_of(data).mark, len(data)))
 
 
 def without_end(session: Path) -> None:

@@ -165,3 +165,22 @@ def test_a_flipped_bit_of_the_journal_is_named_and_a_missing_journal_too(session
     journal.unlink()
     assert words_everywhere(session, 1) == ("complete", "incomplete")
     assert ask("verify", session, status=1).stdout.startswith("error: journal.jsonl: is missing; ")
+
+
+def test_what_is_lost_in_a_damaged_segment_is_not_looked_for_behind_the_last_one(session: Path):
+    for name in ("0001.mcap", "0005.mcap"):
+        path = session / "telemetry" / name
+        whole = path.read_bytes()
+        flip(path, len(whole) // 2)
+        found = json.loads(ask("verify", session, "--json", status=1).stdout)["findings"]
+        assert {each["where"] for each in found if each["severity"] == "error"} == {f"telemetry/{name}"}
+        path.write_bytes(whole)
+
+
+def test_damaged_notes_are_named_by_all(session: Path):
+    ask("note", session, "a cloudy night")
+    ask("tag", session, "keep")
+    flip(session / "notes.jsonl", 40)
+    assert words_everywhere(session, 1) == ("complete", "damaged")
+    (line, *_) = ask("verify", session, status=1).stdout.splitlines()
+    assert line == "error: notes.jsonl: line 1 of 2 is damaged; the lines after it count"

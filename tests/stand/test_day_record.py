@@ -16,7 +16,7 @@ from foundation.items import Batch, Event
 from foundation.patience import Patience
 from foundation.readings import Reading
 from recording.reading.contents import RUN_END
-from recording.reading.notes import add_tags
+from recording.reading.notes import NOTES_NAME, add_tags
 from recording.reading.session import Session
 from recording.repair.verify import verify
 from stand.assembly import Assembly
@@ -120,11 +120,13 @@ async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_ta
     said: list[Event] = []
     hub.subscribe(lambda item: said.append(item) if isinstance(item, Event) else None)
     names: list[str] = []
-    for _ in range(3):
+    for _ in range(4):
         names.append((await record.begin()).directory.name)
         await record.end(20.0)
         clock.go_to_midnight(-60.0)
-    add_tags(tmp_path / names[1], ["keep"], "eva", 1)
+    for name in (names[1], names[3]):
+        add_tags(tmp_path / name, ["keep"], "eva", 1)
+    (tmp_path / names[3] / NOTES_NAME).write_bytes(b"a damaged line\n")
     for name in ("20200101-overnight", "20200101-house"):  # a run's, and a folder that is no session
         (tmp_path / name).mkdir()
     today = f"{datetime.fromtimestamp(clock.now_ns() / NS_PER_S):%Y%m%d}"
@@ -135,4 +137,4 @@ async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_ta
         await asyncio.sleep(0.01)
     assert next(event for event in said if event.kind == "idle_logs_removed").data["names"] == [names[0], names[2]]
     kept = sorted(path.name for path in tmp_path.iterdir())
-    assert kept == sorted(["20200101-house", "20200101-overnight", names[1], latest])
+    assert kept == sorted(["20200101-house", "20200101-overnight", names[1], names[3], latest])

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from foundation.clock import WallClock
 from foundation.errors import SessionError
-from stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, encode_line
+from recording.reading.journal_lines import journal_lines, lines_of
+from stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, decoded
 from stand.running.memory.journal import JOURNAL_NAME, Journal, taken_over
-from tests.journals import read_lines
+from tests.journals import MARK, lines_with, read_lines
 
 ENTRIES = [
     Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),
@@ -62,15 +63,15 @@ def on_disk(directory: Path):
 
 @given(st.lists(entries, max_size=8))
 def test_every_entry_is_read_as_it_was_written(written):
-    data = b"".join(map(encode_line, written))
+    data = lines_with(written)
     assert read_lines(data) == (written, len(data))
     assert data.count(b"\n") == len(written)
 
 
 @given(st.lists(entries, max_size=6), st.data())
 def test_any_cut_gives_the_entries_before_it(written, data):
-    lines = [encode_line(entry) for entry in written]
-    whole = b"".join(lines)
+    whole = lines_with(written)
+    lines = whole.splitlines(keepends=True)
     cut = data.draw(st.integers(0, len(whole)))
     found, size_bytes = read_lines(whole[:cut])
     assert found == written[: len(found)]
@@ -80,7 +81,7 @@ def test_any_cut_gives_the_entries_before_it(written, data):
 
 @given(st.lists(entries, max_size=6), st.data())
 def test_garbage_at_the_end_costs_nothing_and_a_flipped_bit_its_line(written, data):
-    whole = b"".join(map(encode_line, written))
+    whole = lines_with(written)
     assert read_lines(whole + data.draw(st.binary(max_size=200)))[0] == written
     if whole:
         damaged = bytearray(whole)
@@ -104,7 +105,7 @@ def flipped(path: Path, number: int) -> bytes:
 def test_a_damaged_line_is_reported_and_kept_aside_and_the_lines_after_it_count(tmp_path):
     path = new_journal(tmp_path, *ENTRIES)
     damaged = flipped(path, 3)
-    path.write_bytes(damaged + encode_line(ENTRIES[3])[:-4])  # and a torn tail
+    path.write_bytes(damaged + lines_with(ENTRIES[3:4], len(damaged))[:-4])  # and a torn tail
     for _ in range(2):  # the second time the copy is there
         journal, found = Journal.open(tmp_path)
         assert found == ENTRIES[:3] + ENTRIES[4:]
@@ -120,6 +121,22 @@ def test_a_damaged_line_is_reported_and_kept_aside_and_the_lines_after_it_count(
     asyncio.run(write(journal))
     assert [copy.name for copy in sorted(tmp_path.iterdir())] == ["journal.jsonl", "journal.jsonl.damaged"]
     assert (tmp_path / "journal.jsonl.damaged").read_bytes().startswith(damaged)
+
+
+def test_lines_of_another_place_or_journal_do_not_count(tmp_path):
+    """A sector that the disk wrote elsewhere holds whole lines with right CRCs: one may clear a trip."""
+    path, other = new_journal(tmp_path, *ENTRIES), lines_with(ENTRIES, mark=b"0badf00d")
+    whole = path.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    moved = b"".join([*lines[:2], lines[5], *lines[3:]])
+    foreign = other[: len(lines[0])] + whole[len(lines[0]) :]
+    for data, lost in ((moved, 2), (foreign, 0)):
+        found = lines_of(data)
+        assert [text for text in found.sound if decoded(text) not in ENTRIES] == []
+        assert lost + 1 in found.damaged
+        assert len(found.sound) < len(ENTRIES)
+    assert lines_of(foreign).damaged == (1,)
+    assert lines_of(other).damaged == ()
 
 
 def test_a_second_damage_is_kept_aside_as_well(tmp_path):
@@ -148,7 +165,7 @@ def test_a_damaged_last_line_is_cut_off_but_not_lost(tmp_path):
 def test_a_torn_tail_is_cut_off_and_the_journal_goes_on_behind_the_last_whole_line(tmp_path):
     path = new_journal(tmp_path, *ENTRIES[:3])
     whole = path.read_bytes()
-    path.write_bytes(whole + encode_line(ENTRIES[3])[:-4])
+    path.write_bytes(whole + lines_with(ENTRIES[3:4], len(whole))[:-4])
     journal, found = Journal.open(tmp_path)
     assert found == ENTRIES[:3]
     assert path.read_bytes() == whole
@@ -174,7 +191,7 @@ def test_no_journal_and_a_second_one_are_refused_with_a_sentence(tmp_path):
 
 @pytest.mark.parametrize("line", [b'{"entry": "Teleported", "time_ns": 1}', b'{"entry": "Gap", "to": 1}', b"[]", b"x"])
 def test_a_whole_line_of_another_version_is_refused_with_a_sentence(tmp_path, line):
-    (tmp_path / JOURNAL_NAME).write_bytes(b"%08x %s\n" % (zlib.crc32(line), line))
+    (tmp_path / JOURNAL_NAME).write_bytes(journal_lines([line], MARK))
     with pytest.raises(SessionError, match="of another version of thermostand"):
         Journal.open(tmp_path)
     (tmp_path / JOURNAL_NAME).unlink()

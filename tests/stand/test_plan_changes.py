@@ -33,10 +33,10 @@ from foundation.errors import ConfigError
 from foundation.items import Event, StepMark, StepState
 from foundation.readings import Frame
 from stand.gate import OPERATOR
-from stand.running.memory.entries import Change, Edited, Extended, Skipped, Step, change_of, data_of, encode_line
+from stand.running.memory.entries import Change, Edited, Extended, Skipped, Step, change_of, data_of
 from stand.running.memory.fold import fold, refusal
 from stand.running.memory.journal import JOURNAL_NAME
-from tests.journals import read_lines
+from tests.journals import lines_with, read_lines
 from tests.stand.small_stand import Life
 
 CAPTURE = Capture(4, 5.0, 0.1, Role.FIT, 24.0)
@@ -216,7 +216,7 @@ def test_a_change_whose_line_is_lost_is_known_by_the_recording(life: Callable[..
     state, start_ns = here.log.state, killed(here)
     path = tmp_path / JOURNAL_NAME
     entries = read_lines(path.read_bytes())[0]
-    path.write_bytes(b"".join(encode_line(entry) for entry in entries if not isinstance(entry, Change)))
+    path.write_bytes(lines_with(entry for entry in entries if not isinstance(entry, Change)))
     here = life(start_ns)
     assert (here.log.state.plan, here.log.state.changes) == (state.plan, state.changes)
 
@@ -268,7 +268,7 @@ def test_what_cannot_be_changed_says_why_and_changes_nothing(change: Change, why
     [Skipped(7, "a"), Extended(7, "a", 1.5), Edited(7, 2, [{"kind": "Soak", "parameters": {"duration_s": 1.0}}])],
 )
 def test_a_change_is_the_same_in_the_journal_and_in_the_recording(change: Change):
-    assert read_lines(encode_line(change))[0] == [change]
+    assert read_lines(lines_with([change]))[0] == [change]
     assert change_of(7, {**data_of(change), "frames": 3}) == change
     assert change_of(7, {"change": "Teleported"}) is None
     assert change_of(7, {"change": "Skipped"}) is None

@@ -28,12 +28,11 @@ from stand.running.memory.entries import (
     Taken,
     Tripped,
     Written,
-    encode_line,
 )
 from stand.running.memory.fold import after, fold
 from stand.running.memory.state import RunState
 from stand.running.resume import folded
-from tests.journals import read_lines
+from tests.journals import lines_with, read_lines
 from tests.stand.test_run_table import ID, PLAN, SOAK, S
 
 ids = st.sampled_from([*ID, "unknown"])
@@ -116,8 +115,7 @@ def test_what_is_not_written_is_proved_by_the_recording_or_void_after_a_gap(entr
 @given(runs())
 def test_the_lines_of_a_journal_make_the_same_state(entries):
     written = [Begun(0, "night-1", "0f", {}), *(entry for entry in entries if isinstance(entry, Written))]
-    lines = b"".join(map(encode_line, written))
-    assert fold(PLAN, read_lines(lines)[0]) == fold(PLAN, written)
+    assert fold(PLAN, read_lines(lines_with(written))[0]) == fold(PLAN, written)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +134,7 @@ def test_the_lines_of_a_journal_make_the_same_state(entries):
 )
 def test_entries_that_no_run_has_written_are_refused(entry):
     with pytest.raises(SessionError, match="no run has written such entries"):
-        folded(PLAN, read_lines(encode_line(entry))[0])
+        folded(PLAN, read_lines(lines_with([entry]))[0])
 
 
 @pytest.mark.parametrize("by", [[{}], [{"kind": "Soak", "parameters": 5}], [{"kind": ["Soak"], "parameters": {}}]])

@@ -111,7 +111,14 @@ async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path
     await asyncio.gather(*tasks)
     (directory,) = (tmp_path / "out").iterdir()
     assert (verify(directory).run, verify(directory).files) == (Run.TRIPPED, Files.SOUND)
-    entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
+    data = (directory / JOURNAL_NAME).read_bytes()
+    entries = read_lines(data)[0]
+    lines = data.splitlines(keepends=True)
+    last = next(number for number, entry in enumerate(entries) if isinstance(entry, Tripped))
+    copy = Path(shutil.copytree(directory, tmp_path / "copy"))
+    (copy / JOURNAL_NAME).write_bytes(b"".join(lines[:last]))  # as a disk that has lost its last flushes
+    with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --clear"):
+        await asyncio.to_thread(interruption, copy)
     flip(directory, -1, *(number for number, entry in enumerate(entries) if isinstance(entry, Tripped)))
     assert (verify(directory).run, verify(directory).files) == (Run.TRIPPED, Files.DAMAGED)
     for _ in range(2):  # also when the last line has been cut off

@@ -20,14 +20,14 @@ from recording.reading.glance import glance
 from recording.reading.run_word import Files, Run
 from recording.reading.session import Session
 from recording.repair.verify import verify
-from stand.running.memory.entries import Dwell, Gap, Step, encode_line
+from stand.running.memory.entries import Dwell, Gap, Step
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.order import Order
 from stand.running.resume import Interruption, interruption
 from stand.running.run import Interrupted, resume, run_virtual
 from stand.simulator import ControlSocket
 from tests.asking import ask, ask_status
-from tests.journals import read_lines
+from tests.journals import lines_with, read_lines
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_run import at_step, fault
@@ -200,10 +200,10 @@ def test_a_session_whose_files_or_journal_are_not_its_own_is_not_resumed(tmp_pat
     (directory,) = (tmp_path / "out").iterdir()
     journal = directory / JOURNAL_NAME
     begun = read_lines(journal.read_bytes())[0][0]
-    journal.write_bytes(encode_line(replace(begun, texts={**begun.texts, "recipe.yaml": "0"})))
+    journal.write_bytes(lines_with([replace(begun, texts={**begun.texts, "recipe.yaml": "0"})]))
     with pytest.raises(SessionError, match="the attached files are not those its run began with"):
         interruption(directory)
-    journal.write_bytes(encode_line(replace(begun, plan="0")))
+    journal.write_bytes(lines_with([replace(begun, plan="0")]))
     with pytest.raises(SessionError, match="this version of thermostand makes another plan of its recipe"):
         interruption(directory)
     journal.write_bytes(b"")

@@ -140,11 +140,11 @@ class Evidence:
 
     @cached_property
     def journal(self) -> list[dict[str, Any]]:
-        """The entries of the journal: a checksum and a JSON a line."""
+        """The entries of the journal: a checksum, a mark and a JSON a line."""
         path, found = self.session / "journal.jsonl", []
         for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
             try:
-                found.append(json.loads(line.partition(" ")[2]))
+                found.append(json.loads(line[line.find("{") :]))
             except ValueError:
                 continue
         return found

@@ -39,7 +39,7 @@ from experiments.steps import Step as PlanStep
 from experiments.steps import kind_of, parameters_of
 from foundation.document_faults import path_text
 from foundation.errors import SessionError
-from recording.reading.journal_lines import JOURNAL_NAME, journal_line
+from recording.reading.journal_lines import JOURNAL_NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,9 +236,9 @@ def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
         return None
 
 
-def encode_line(entry: Written) -> bytes:
-    """The entry as a line."""
-    return journal_line(json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode())
+def encoded(entry: Written) -> bytes:
+    """What its line says."""
+    return json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode()
 
 
 def decoded(text: bytes) -> Written:

@@ -24,13 +24,20 @@ from foundation.hub import Hub
 from foundation.items import Event
 from foundation.patience import Patience
 from recording.format.layout import TELEMETRY
-from recording.reading.journal_lines import JOURNAL_NAME, LIMIT_BYTES, damage_text, lines_of
+from recording.reading.journal_lines import (
+    JOURNAL_NAME,
+    LIMIT_BYTES,
+    damage_text,
+    journal_lines,
+    lines_of,
+    mark_of,
+)
 from recording.writing.disk import JOURNAL_LINE, Disk
 from recording.writing.home import FolderLost
 from recording.writing.locks import lock
 from stand.fault import Fault
 from stand.gate import IN_WORDS, INTERLOCK, STOPPING
-from stand.running.memory.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encode_line
+from stand.running.memory.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encoded
 from stand.running.memory.fold import after
 from stand.running.memory.state import RunState
 
@@ -46,8 +53,9 @@ class Journal:
     are kept in memory: a journal that was removed under its run is rewritten when an operator has cleared that.
     """
 
-    def __init__(self, path: Path, fd: int, data: bytes, damage: str = "") -> None:
+    def __init__(self, path: Path, fd: int, data: bytes, mark: bytes, damage: str = "") -> None:
         self.path = path
+        self._mark = mark
         self.damage = damage  # a sentence, when lines of it are damaged
         self.name = path.name
         self.lost = ""
@@ -55,6 +63,7 @@ class Journal:
         self._line: Line | None = None  # to the disk process, when that has the file
         self._disk: Disk | None = None
         self._acknowledged = bytearray(data)
+        self._end = len(data)  # of all lines, those that wait too
         self._waiting: list[bytes] = []
         self._failing = False
         self._notes: set[Task[None]] = set()
@@ -71,7 +80,7 @@ class Journal:
             sync_folder(directory)
         except OSError as error:
             raise SessionError(f"{path}: no journal can be begun here ({error.strerror})") from error
-        return cls(path, fd, b"")
+        return cls(path, fd, b"", mark_of(directory.absolute().name))
 
     @classmethod
     def open(cls, directory: Path) -> tuple[Journal, list[Written]]:
@@ -95,7 +104,7 @@ class Journal:
                 raise SessionError(
                     f"{path}: is larger than {LIMIT_BYTES // 1_000_000} MB, so no journal; begin a new run"
                 )
-            entries, data, damage = _opened(fd, path)
+            entries, data, mark, damage = _opened(fd, path)
         except BaseException as error:
             os.close(fd)
             if isinstance(error, BlockingIOError):
@@ -103,7 +112,7 @@ class Journal:
             if isinstance(error, OSError):
                 raise SessionError(f"{path}: cannot be read ({error.strerror})") from error
             raise
-        return cls(path, fd, data, damage), entries
+        return cls(path, fd, data, mark, damage), entries
 
     def start(self, clock: Clock, trouble: Callable[[str], None], disk: Disk | None = None) -> None:
         """Before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence, `disk` is the
@@ -134,7 +143,9 @@ class Journal:
     def _take(self, entries: Iterable[Written]) -> None:
         if self._lane is None:
             raise ValueError("a journal is started before it is written")
-        self._waiting.extend(map(encode_line, entries))
+        for entry in entries:
+            self._waiting.append(journal_lines((encoded(entry),), self._mark, self._end))
+            self._end += len(self._waiting[-1])
 
     async def _committed(self) -> None:
         if self._lane is None:
@@ -206,9 +217,9 @@ class Journal:
         return getattr(self._file, method)(data)
 
 
-def _opened(fd: int, path: Path) -> tuple[list[Written], bytes, str]:
+def _opened(fd: int, path: Path) -> tuple[list[Written], bytes, bytes, str]:
     """Lock, read, keep a copy when lines are damaged, and cut off what was not acknowledged: the entries, the bytes
-    that stay and what is damaged; OSError, SessionError."""
+    that stay, the file's mark and what is damaged; OSError, SessionError."""
     lock(fd)
     with open(fd, "rb", closefd=False) as file:
         data = file.read()
@@ -221,7 +232,7 @@ def _opened(fd: int, path: Path) -> tuple[list[Written], bytes, str]:
     if lines.size_bytes < len(data):
         os.ftruncate(fd, lines.size_bytes)
         os.fsync(fd)
-    return entries, data[: lines.size_bytes], damage
+    return entries, data[: lines.size_bytes], lines.mark or mark_of(path.absolute().parent.name), damage
 
 
 def _kept(path: Path, data: bytes, last_damaged: int) -> Path:
