@@ -19,9 +19,12 @@ import math
 import numpy as np
 
 PLACE, CAMERA, AMBIENT, SWITCHED_ON, HISTORY, STATE = 1, 2, 4, 8, 16, 32
-"""Flags: the point is outside the markers' hull; the camera's temperature, or the air's (in older models also its
-rate of change), is outside the calibrated range; the camera was switched on too recently; it has not been followed for
-long enough; each is in its range, but not in this combination."""
+"""Flags: the point is outside the markers' hull; the camera's temperature, or the air's, is outside the
+calibrated range; the camera was switched on too recently; it has not been followed for long enough; each is in its
+range, but not in this combination."""
+
+VERSION = 3
+"""Of the JSON file. From thermostand 0.2.0 on each version reads the files of all before it."""
 
 RATE_TAU_S = 600.0
 """The ambient's rate of change is that of its 10 min lag."""
@@ -158,8 +161,8 @@ class Drift:
 
     def __init__(self, model):
         """model: what the JSON file holds; ValueError when numbers of it are none, or do not fit together."""
-        if model.get("format") != "thermostand drift runtime" or model.get("version") not in (1, 2):
-            raise ValueError("not a drift runtime model of this version")
+        if model.get("format") != "thermostand drift runtime" or model.get("version") != VERSION:
+            raise ValueError("not a drift runtime model of this version; export the model anew")
         _check(model)
         self._model = model
         self._coefficients = np.array(model["coefficients_px"])
@@ -191,8 +194,7 @@ class Drift:
     @property
     def memory_s(self):
         """How long it must have been fed to be right, s; 0 for a form without memory."""
-        longest_s = SETTLED_TAUS * max(self._model.get("taus_s", []), default=0.0)
-        return self._model.get("history_s", longest_s)
+        return self._model.get("history_s", 0.0)
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """As ThermalState.advance."""
@@ -269,7 +271,7 @@ class Drift:
         """The terms of the thermal state."""
         camera_degC, air_degC = self._model["reference_degC"], self._model["reference_ambient_degC"]
         taus_s, radii_K = self._model["taus_s"], self._model["plays_K"]
-        parts = [tuple(part) for part in self._model.get("part_plays", [])]
+        parts = [tuple(part) for part in self._model["part_plays"]]
         state, own = self._state, (self._state.camera_degC - camera_degC) / SPAN_K
         values = []
         for kind, parameter, *of_part in self._model["terms"]:
@@ -286,9 +288,7 @@ class Drift:
                     "ambient lag": lambda at=at: (state.ambient_lag[at] - air_degC) / SPAN_K,
                     "ambient lag squared": lambda at=at: ((state.ambient_lag[at] - air_degC) / SPAN_K) ** 2,
                     "ambient lag cubed": lambda at=at: ((state.ambient_lag[at] - air_degC) / SPAN_K) ** 3,
-                    "power lag": lambda at=at: state.power_lag[at] - 1,
                     "camera lag": lambda at=at: (state.camera_lag[at] - camera_degC) / SPAN_K,
-                    "camera lag squared": lambda at=at: ((state.camera_lag[at] - camera_degC) / SPAN_K) ** 2,
                     "play": lambda r=parameter: (state.plays[radii_K.index(r)] - camera_degC) / SPAN_K,
                 }[kind]()
             )
@@ -313,7 +313,6 @@ class Drift:
             return found
         if not self._state.begun:
             return CAMERA | AMBIENT | SWITCHED_ON | HISTORY | STATE
-        found |= _beyond(self._state.rate_K_per_h, self.limits("rate_range_K_per_h"), AMBIENT)
         found |= _beyond(self._state.on_s, (self.least_on_s, math.inf), SWITCHED_ON)
         away, matrix = self._away(), np.array(self._model["leverage_matrix"])
         found |= _beyond(away @ matrix @ away, (0.0, self.most_leverage), STATE)
@@ -322,13 +321,9 @@ class Drift:
         return found | _beyond(self._state.settled_s, (self.memory_s, math.inf), HISTORY)
 
     def limits(self, name):
-        """A calibrated range (low, high) with its margin; the paper's form has none. How fast the air may change is
-        part of the state, in models that know its leverage."""
+        """A calibrated range (low, high) with its margin; the paper's form has none."""
         low, high = self._model[name]
-        if name == "rate_range_K_per_h" and self._model.get("leverage") is not None:
-            return -math.inf, math.inf
-        least = 1.0 if name == "rate_range_K_per_h" else 0.0
-        margin = 0.0 if self._model["form"] == "paper" else max(_MARGIN * (high - low), least)
+        margin = 0.0 if self._model["form"] == "paper" else _MARGIN * (high - low)
         return low - margin, high + margin
 
     @property
@@ -340,8 +335,7 @@ class Drift:
     @property
     def most_leverage(self):
         """Of a state that is still near the calibrated ones."""
-        leverage = self._model.get("leverage")
-        return math.inf if leverage is None else _MORE_LEVERAGE * leverage
+        return _MORE_LEVERAGE * self._model["leverage"]
 
 
 def _check(model):

@@ -28,7 +28,7 @@ from foundation.files import write_whole
 Float = NDArray[np.float64]
 
 _TEMPLATE = "drift_runtime.h"
-_KINDS = ("constant", "camera", "ambient lag", "power lag", "camera lag", "play")
+_KINDS = ("constant", "camera", "ambient lag", "camera lag", "play")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,6 @@ def _constants(model: Mapping[str, Any]) -> Iterator[str]:
         HULL_MARGIN_PX=drift_runtime.HULL_MARGIN_PX,
         COLD_K=drift_runtime.COLD_K,
         UNPOWERED_TAU_S=drift_runtime.UNPOWERED_TAU_S,
-        SELF_HEATING_K=float(model.get("self_heating_K", 1.0)),
         MEMORY_S=float(drift_runtime.Drift(model).memory_s),
     )
     yield f"enum {{ {', '.join(_kind_name(kind) for kind in _KINDS)} }};"
@@ -126,7 +125,6 @@ def _ranges(model: Mapping[str, Any], *, thermal: bool) -> Iterator[str]:
     yield _table("drift_camera_range_degC[2]", np.array(drift.limits("camera_range_degC")))
     if not thermal:
         return
-    yield _table("drift_rate_range_K_per_h[2]", np.array(drift.limits("rate_range_K_per_h")))
     yield _table("drift_ambient_range_degC[2]", np.array(drift.limits("ambient_range_degC")))
     yield _table("drift_leverage_matrix[DRIFT_TERMS][DRIFT_TERMS]", np.array(model["leverage_matrix"]))
     yield from _definitions(LEAST_ON_S=drift.least_on_s, MOST_LEVERAGE=drift.most_leverage)
@@ -152,9 +150,9 @@ def _thermal(model: Mapping[str, Any]) -> tuple[list[_CTerm], Float, int]:
             at = len(plays_K) + parts.index((tau_s, share, parameter))
             terms.append(_CTerm("play", at, 1, air + share * (camera - air), span, reference))
             continue
-        origin = {"constant": 0.0, "ambient lag": air, "power lag": 1.0}.get(base, camera)
+        origin = {"constant": 0.0, "ambient lag": air}.get(base, camera)
         power = 0 if base == "constant" else power_of(Kind(kind))
-        terms.append(_CTerm(base, at, power, origin, 1.0 if base == "power lag" else span, reference))
+        terms.append(_CTerm(base, at, power, origin, span, reference))
     right, down, xx, xy, yx, yy, bend_x, bend_y = np.array(model["coefficients_px"])
     zero = np.zeros_like(right)
     along_i, along_j = [right, xx, bend_x, xy, bend_y, zero], [down, yx, zero, yy, bend_x, bend_y]

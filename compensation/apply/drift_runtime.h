@@ -16,7 +16,7 @@
 enum {
     DRIFT_PLACE = 1,        /* outside the markers' hull */
     DRIFT_CAMERA = 2,       /* the camera's temperature is outside the calibrated range */
-    DRIFT_AMBIENT = 4,      /* the air's temperature, in older models also how fast it changes */
+    DRIFT_AMBIENT = 4,      /* the air's temperature is outside the calibrated range */
     DRIFT_SWITCHED_ON = 8,  /* the camera was switched on too recently */
     DRIFT_HISTORY = 16,     /* the camera has not been followed for long enough */
     DRIFT_STATE = 32        /* each is in its range, but not in this combination */
@@ -26,7 +26,7 @@ typedef struct drift_state {
     int begun;  /* 0 in a gap */
     int unseen; /* 1 from a begin without power or temperature, until the camera tells one */
     double air_degC, camera_degC, settled_s, on_s;
-    double ambient_lag[DRIFT_LAGS], power_lag[DRIFT_LAGS], camera_lag[DRIFT_LAGS];
+    double ambient_lag[DRIFT_LAGS], camera_lag[DRIFT_LAGS];
     double plays[DRIFT_PLAYS + 1];
     unsigned flags;                /* of the state, for every position */
     double field[2][DRIFT_FIELD];  /* the displacement as polynomials of the position, px */
@@ -52,7 +52,6 @@ static inline void drift_features(const drift_state *state, double values[DRIFT_
         switch (drift_terms[k].kind) {
         case DRIFT_OF_CAMERA: value = state->camera_degC; break;
         case DRIFT_OF_AMBIENT_LAG: value = state->ambient_lag[at]; break;
-        case DRIFT_OF_POWER_LAG: value = state->power_lag[at]; break;
         case DRIFT_OF_CAMERA_LAG: value = state->camera_lag[at]; break;
         case DRIFT_OF_PLAY: value = state->plays[at]; break;
         default: break;
@@ -74,8 +73,6 @@ static inline unsigned drift_state_flags(const drift_state *state, const double 
     double leverage = 0.0;
     int k, l;
     if (!state->begun) return DRIFT_CAMERA | DRIFT_AMBIENT | DRIFT_SWITCHED_ON | DRIFT_HISTORY | DRIFT_STATE;
-    found |= drift_beyond(3600.0 / drift_taus_s[0] * (state->air_degC - state->ambient_lag[0]),
-                          drift_rate_range_K_per_h[0], drift_rate_range_K_per_h[1], DRIFT_AMBIENT);
     found |= drift_beyond(state->ambient_lag[1], drift_ambient_range_degC[0], drift_ambient_range_degC[1],
                           DRIFT_AMBIENT);
     found |= drift_beyond(state->on_s, DRIFT_LEAST_ON_S, HUGE_VAL, DRIFT_SWITCHED_ON);
@@ -112,7 +109,7 @@ static inline void drift_init(drift_state *state) {
     int k;
     state->begun = state->unseen = 0;
     state->air_degC = state->camera_degC = state->settled_s = state->on_s = NAN;
-    for (k = 0; k < DRIFT_LAGS; ++k) state->ambient_lag[k] = state->power_lag[k] = state->camera_lag[k] = NAN;
+    for (k = 0; k < DRIFT_LAGS; ++k) state->ambient_lag[k] = state->camera_lag[k] = NAN;
     for (k = 0; k <= DRIFT_PLAYS; ++k) state->plays[k] = NAN;
     drift_update(state);
 }
@@ -141,7 +138,6 @@ static inline void drift_begin(drift_state *state, double ambient_degC, double p
     state->camera_degC = ambient_degC + excess_K;
     for (k = 0; k < DRIFT_LAGS; ++k) {
         state->ambient_lag[k] = ambient_degC;
-        state->power_lag[k] = cold ? 0.0 : drift_clip(excess_K / DRIFT_SELF_HEATING_K, 0.0, 1.0);
         state->camera_lag[k] = state->camera_degC;
     }
     for (k = 0; k <= DRIFT_PLAYS; ++k) state->plays[k] = drift_push(state, k);
@@ -169,7 +165,6 @@ static inline unsigned drift_advance(drift_state *state, double dt_s, double amb
     for (k = 0; k < DRIFT_LAGS; ++k) {
         const double gained = -expm1(-dt_s / drift_taus_s[k]);
         state->ambient_lag[k] += (ambient_degC - state->ambient_lag[k]) * gained;
-        state->power_lag[k] += (power_on - state->power_lag[k]) * gained;
         state->camera_lag[k] += (driver_degC - state->camera_lag[k]) * gained;
     }
     for (k = 0; k < DRIFT_PLAYS; ++k) {

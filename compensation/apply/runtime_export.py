@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from compensation import drift_runtime
 from compensation.drift.between_nights import BetweenNights
 from compensation.drift.drift_model import DriftModel
 from compensation.drift.paper_model import PaperModel
@@ -40,7 +41,7 @@ def runtime_model(model: DriftModel) -> dict[str, object]:
     facts = model.facts
     common: dict[str, object] = {
         "format": "thermostand drift runtime",
-        "version": 2,
+        "version": drift_runtime.VERSION,
         "form": model.form,
         "camera_serial": facts.camera_serial,
         "software_version": facts.software_version,
@@ -87,9 +88,8 @@ def _thermal(model: ThermalModel) -> dict[str, object]:
         "reference_features": model.reference_features.tolist(),
         "coefficients_px": model.coefficients.tolist(),
         "ambient_range_degC": valid.ambient_degC,
-        "rate_range_K_per_h": valid.rate_K_per_h,
         "least_on_s": None if math.isinf(valid.least_on_s) else valid.least_on_s,
-        "leverage": None if math.isinf(valid.leverage) else valid.leverage,
+        "leverage": valid.leverage,
         "leverage_matrix": model.leverage_matrix.tolist(),
         "history_s": model.history_s,
     }

@@ -24,8 +24,8 @@ class Candidate(Document):
 
     form: paper or thermal. name: in words. terms: coefficients of both coordinates together. rms_px: held-out RMS along
     I and J, all folds counting the same; fold_rms_px: of each fold. moving_rms_px: of frames on the way to set-points
-    and after switching on, held out as well, of the one in use, where such were recorded. bic: in older files. chosen:
-    whether it is the best of its form.
+    and after switching on, held out as well, of the one in use, where such were recorded. chosen: whether it is the
+    best of its form.
     """
 
     form: str
@@ -33,7 +33,6 @@ class Candidate(Document):
     terms: int
     rms_px: Pair
     moving_rms_px: Pair | None = None
-    bic: float | None = None
     chosen: bool
     fold_chamber_degC: tuple[float, ...]
     fold_rms_px: tuple[Pair, ...]

@@ -25,7 +25,7 @@ paper's form only (states_of)."""
 
 class Outside(IntFlag):
     """Why a correction is an extrapolation. PLACE: beyond the hull of the markers (plus 1 px). CAMERA: the camera's
-    temperature. AMBIENT: the air's (in older models also how fast it changes). SWITCHED_ON: the camera was switched
+    temperature. AMBIENT: the air's. SWITCHED_ON: the camera was switched
     on more recently than ever in the calibration. HISTORY: the record does not reach back far enough, or has a gap.
     STATE: each of these is in its range, but not in this combination."""
 

@@ -1,10 +1,7 @@
 """Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null.
 
-A file holds the form in use and, as `other`, the one that was not chosen. Files of version 2 have one form, those
-before version 4 know of no bumps, those before version 5 have correlations between the motions, which are dropped,
-those before version 6 no powers of the air's lags, those before version 7 claim too little on another night: their
-covariance is also the matrix of leverage. Those before version 8 have no plays of parts, and what another night adds is
-in their discrepancy.
+A file holds the form in use and, as `other`, the one that was not chosen. From 0.2.0 on formats are kept: each version
+of the program reads the files of all before it. Those of versions before 9 are of unreleased versions and are not read.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
 from compensation.drift.between_nights import BetweenNights
 from compensation.drift.bump import Bump
@@ -25,10 +22,9 @@ from compensation.drift.facts import ModelFacts
 from compensation.drift.hull import is_area
 from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from compensation.drift.polynomial import exponents
-from compensation.drift.terms import MOTIONS, Kind, Term
+from compensation.drift.terms import MOTIONS, TERMS, Kind, Term
 from compensation.drift.thermal_model import ThermalModel, ThermalRange
 from compensation.drift_runtime import HOTTEST_degC
-from compensation.history.states import Float
 from compensation.sound_values import (
     Degrees,
     Hull,
@@ -44,13 +40,14 @@ from foundation.documents import Document, load_json
 from foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 
 _FACTS = (
     *("software_version", "camera_serial", "session_ids", "target_name", "camera_range_degC", "reference_degC"),
     *("reference_chamber_degC", "bumps"),
 )
 """Fields of ModelFacts that a file has as they are."""
+_FITTED = {term.kind for term in TERMS}
 _REMEMBERS_NOTHING = (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE, Kind.PLAY)
 _LONGEST_S = 1e9
 Spread = tuple[NotNegative, NotNegative]
@@ -58,11 +55,19 @@ Range = tuple[Degrees, Degrees]
 Rows = tuple[tuple[float, ...], ...]
 
 
+def _known(version: int) -> int:
+    if version < SCHEMA_VERSION:
+        raise ValueError(f"{version} is of an earlier, unreleased version of thermostand; fit the model anew")
+    if version > SCHEMA_VERSION:
+        raise ValueError(f"{version} is of a later version; this one reads up to {SCHEMA_VERSION}")
+    return version
+
+
 class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Literal[2, 3, 4, 5, 6, 7, 8] = SCHEMA_VERSION
+    schema_version: Annotated[int, AfterValidator(_known)] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]
@@ -100,6 +105,8 @@ class TermFile(Document):
 
     @model_validator(mode="after")
     def _has_time(self) -> TermFile:
+        if self.kind not in _FITTED:
+            raise ValueError(f"no model has a {self.kind}")
         tau_s = self.tau_s if self.kind is Kind.PART_PLAY else self.parameter
         if tau_s == 0 and self.kind not in _REMEMBERS_NOTHING:
             raise ValueError(f"a {self.kind} has a time constant above 0")
@@ -108,8 +115,8 @@ class TermFile(Document):
 
 class ThermalFile(_File):
     """The thermal form. coefficient_covariance_px2 (8 H, H): of each motion one below the other. least_on_s: null when
-    the camera was never switched on within the record. usual_leverage_px2: in older files. between_nights_px: one
-    standard deviation of what a night that was not fitted adds; with nights_compared 0 it was assumed, not measured."""
+    the camera was never switched on within the record. between_nights_px: one standard deviation of what a night that
+    was not fitted adds, null where that is not known; with nights_compared 0 it was assumed, not measured."""
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[TermFile, ...]
@@ -120,14 +127,12 @@ class ThermalFile(_File):
     coefficients_px: Rows
     coefficient_covariance_px2: Rows
     ambient_range_degC: Range
-    rate_range_K_per_h: Pair
     least_on_s: NotNegative | None
-    leverage_matrix_px2: Rows | None = None
-    leverage_px2: Annotated[float, Field(gt=0)] | None = None
-    usual_leverage_px2: float | None = None
-    history_s: NotNegative | None = None
-    between_nights_px: Spread | None = None
-    nights_compared: Annotated[int, Field(ge=0)] = 0
+    leverage_matrix_px2: Rows
+    leverage_px2: Annotated[float, Field(gt=0)]
+    history_s: NotNegative
+    between_nights_px: Spread | None
+    nights_compared: Annotated[int, Field(ge=0)]
     other: PaperFile | None = None
 
 
@@ -201,17 +206,12 @@ def _thermal_fields(model: ThermalModel) -> dict[str, object]:
         "coefficient_covariance_px2": np.concatenate(model.coefficient_covariance).tolist(),
         "leverage_matrix_px2": model.leverage_matrix.tolist(),
         "ambient_range_degC": model.valid.ambient_degC,
-        "rate_range_K_per_h": model.valid.rate_K_per_h,
-        "least_on_s": _finite(model.valid.least_on_s),
-        "leverage_px2": _finite(model.valid.leverage),
-        "history_s": model.valid.history_s,
+        "least_on_s": None if math.isinf(model.valid.least_on_s) else model.valid.least_on_s,
+        "leverage_px2": model.valid.leverage,
+        "history_s": model.history_s,
         "between_nights_px": None if model.between_nights is None else model.between_nights.sigma_px,
         "nights_compared": 0 if model.between_nights is None else model.between_nights.nights,
     }
-
-
-def _finite(value: float) -> float | None:
-    return None if math.isinf(value) else value
 
 
 def _paper(file: PaperFile) -> PaperModel:
@@ -242,19 +242,17 @@ def _paper(file: PaperFile) -> PaperModel:
 def _thermal(file: ThermalFile) -> ThermalModel:
     """The model of a file; ValueError when its parts do not fit together."""
     count = len(file.terms)
-    covariance, leverage = _blocks(file, count), file.leverage_matrix_px2
+    rows = shaped("coefficient_covariance_px2", file.coefficient_covariance_px2, (MOTIONS * count, count))
+    covariance = rows.reshape(MOTIONS, count, count)
+    leverage_matrix = shaped("leverage_matrix_px2", file.leverage_matrix_px2, (count, count))
     reference_features = shaped("reference_features", file.reference_features, (count,))
     coefficients = shaped("coefficients_px", file.coefficients_px, (MOTIONS, count))
-    leverage_matrix = (
-        covariance[0] + covariance[1] if leverage is None else shaped("leverage_matrix_px2", leverage, (count, count))
-    )
     # Features are about 1 at 20 K from the reference, motions at the image's edge.
     check_terms("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
     check_within_image("reference_features", coefficients @ reference_features, file.image_size_px)
     check_covariance("coefficient_covariance_px2", covariance)
     check_covariance("leverage_matrix_px2", leverage_matrix)
     check_order("ambient_range_degC", file.ambient_range_degC)
-    check_order("rate_range_K_per_h", file.rate_range_K_per_h)
     return ThermalModel(
         facts=_facts(file),
         terms=tuple(Term(term.kind, term.parameter, term.tau_s, term.share) for term in file.terms),
@@ -267,9 +265,8 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         discrepancy_px=np.array(file.discrepancy_px),
         valid=ThermalRange(
             ambient_degC=file.ambient_range_degC,
-            rate_K_per_h=file.rate_range_K_per_h,
             least_on_s=math.inf if file.least_on_s is None else file.least_on_s,
-            leverage=math.inf if file.leverage_px2 is None else file.leverage_px2,
+            leverage=file.leverage_px2,
             history_s=file.history_s,
         ),
         has_warm_up=file.has_warm_up,
@@ -278,14 +275,6 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         if file.between_nights_px is None
         else BetweenNights(file.between_nights_px, file.nights_compared),
     )
-
-
-def _blocks(file: ThermalFile, count: int) -> Float:
-    """(8, H, H)."""
-    given = file.coefficient_covariance_px2
-    whole = bool(given) and len(given[0]) == MOTIONS * count
-    rows = shaped("coefficient_covariance_px2", given, (MOTIONS * count, MOTIONS * count if whole else count))
-    return np.stack([rows[k : k + count, k if whole else 0 :][:, :count] for k in range(0, len(rows), count)])
 
 
 def _facts(file: PaperFile | ThermalFile) -> ModelFacts:

@@ -22,7 +22,8 @@ _SPAN_K = 20.0
 
 class Kind(StrEnum):
     """What a term is made of. CAMERA_LAG: what follows the camera's own temperature, as a lens does. POWER_LAG,
-    CAMERA_LAG_SQUARE: in older models. PART_PLAY: of a part between air and camera that nobody measures, as a mount."""
+    CAMERA_LAG_SQUARE: of night_series.py, in no model. PART_PLAY: of a part between air and camera that nobody
+    measures, as a mount."""
 
     CONSTANT = "constant"
     CAMERA = "camera"

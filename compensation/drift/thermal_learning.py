@@ -172,7 +172,6 @@ def _range(trained: Training) -> ThermalRange:
     states = trained.states.where(np.unique(trained.rows.frame))
     return ThermalRange(
         ambient_degC=_extent(states.ambient_lag_degC[:, 0]),
-        rate_K_per_h=_extent(states.rate_K_per_h),
         least_on_s=float(states.on_s.min()),
     )
 

@@ -27,13 +27,12 @@ _MARGIN = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThermalRange:
-    """What the calibration covered besides the camera's temperature: the quickest lag of the ambient, how fast the
-    ambient changed, K/h, and the shortest time since the camera was switched on, s. leverage: the largest of a training
-    state, inf in models that do not know it, which go by the rate instead. history_s: how long a state must have been
-    followed after a guess until what is left of it does not matter; None: three of the longest time constants."""
+    """What the calibration covered besides the camera's temperature: the quickest lag of the ambient, and the shortest
+    time since the camera was switched on, s. leverage: the largest of a training state, inf until it is known.
+    history_s: how long a state must have been followed after a guess until what is left of it does not matter; None:
+    three of the longest time constants."""
 
     ambient_degC: Pair
-    rate_K_per_h: Pair
     least_on_s: float
     leverage: float = math.inf
     history_s: float | None = None
@@ -123,8 +122,6 @@ class ThermalModel(DriftModel):
     def _state_flags(self, states: States) -> Flags:
         valid = self.valid
         found = range_flags(states.camera_degC, _widened(self.facts.camera_range_degC), Outside.CAMERA)
-        if math.isinf(valid.leverage):
-            found |= range_flags(states.rate_K_per_h, _widened(valid.rate_K_per_h, 1.0), Outside.AMBIENT)
         found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
         if self.memory.taus_s:
             found |= range_flags(states.ambient_lag_degC[:, 0], _widened(valid.ambient_degC), Outside.AMBIENT)
@@ -133,8 +130,8 @@ class ThermalModel(DriftModel):
         return found | range_flags(states.settled_s, (needed_s, np.inf), Outside.HISTORY)
 
 
-def _widened(limits: Pair, least: float = 0.0) -> Pair:
-    margin = max(_MARGIN * (limits[1] - limits[0]), least)
+def _widened(limits: Pair) -> Pair:
+    margin = _MARGIN * (limits[1] - limits[0])
     return limits[0] - margin, limits[1] + margin
 
 

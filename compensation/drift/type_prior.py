@@ -63,7 +63,6 @@ def fit_like(observations: Observations, units: Sequence[ThermalModel]) -> Therm
         valid=replace(
             first.valid,
             ambient_degC=_common([one.valid.ambient_degC for one in units]),
-            rate_K_per_h=_common([one.valid.rate_K_per_h for one in units]),
             least_on_s=least_on_s,
             leverage=max(one.valid.leverage for one in units),
             history_s=max(one.history_s for one in units),

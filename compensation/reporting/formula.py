@@ -44,7 +44,6 @@ def _paper(model: PaperModel) -> FormulaNumbers:
 def _thermal(model: ThermalModel) -> FormulaNumbers:
     width, height = model.facts.image_size
     origin, air = model.facts.reference_degC, model.reference_ambient_degC
-    kinds = {term.kind for term in model.terms}
     lines = (
         "I at the reference = I + a₁ + a₃ x + a₄ y + (a₇ x + a₈ y) x",
         "J at the reference = J + a₂ + a₅ x + a₆ y + (a₇ x + a₈ y) y",
@@ -53,7 +52,6 @@ def _thermal(model: ThermalModel) -> FormulaNumbers:
         f"T = (camera − {origin:z.3f} °C) / {SPAN_K:g} K, its own temperature",
         f"air(τ) = (air near the camera, through a first-order lag τ, − {air:z.3f} °C) / {SPAN_K:g} K",
         "camera(τ) = T through such a lag",
-        *(["power(τ) = the supply (0 or 1) through such a lag − 1"] if Kind.POWER_LAG in kinds else []),
         "play(r) = T through a dead zone of ± r",
         "play(r, τ, s): so of air(τ) + s (camera(τ) − air(τ)), a part that nobody measures",
         "at switching on a camera as cold as the air, lags and plays are at the temperatures of that instant",
@@ -79,9 +77,7 @@ def _feature(term: Term) -> str:
         Kind.AMBIENT_LAG: f"air({minutes})",
         Kind.AMBIENT_LAG_SQUARE: f"air({minutes})²",
         Kind.AMBIENT_LAG_CUBE: f"air({minutes})³",
-        Kind.POWER_LAG: f"power({minutes})",
         Kind.CAMERA_LAG: f"camera({minutes})",
-        Kind.CAMERA_LAG_SQUARE: f"camera({minutes})²",
         Kind.PLAY: f"play({term.parameter:g} K)",
         Kind.PART_PLAY: f"play({term.parameter:g} K, {term.tau_s / 60:g} min, {term.share:g})",
     }[term.kind]

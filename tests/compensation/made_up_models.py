@@ -48,7 +48,7 @@ def thermal(*, warmed: bool = True) -> ThermalModel:
         *(Term(kind) for kind in (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE)),
         *(Term(Kind.AMBIENT_LAG, tau_s) for tau_s in (600.0, 3600.0)),
         *(Term(kind, 3600.0) for kind in (Kind.AMBIENT_LAG_SQUARE, Kind.AMBIENT_LAG_CUBE)),
-        *(Term(kind, 600.0) for kind in (Kind.POWER_LAG, Kind.CAMERA_LAG, Kind.CAMERA_LAG_SQUARE)),
+        Term(Kind.CAMERA_LAG, 600.0),
         Term(Kind.PLAY, 6.0),
         Term(Kind.PLAY, 3.0),
         Term(Kind.PART_PLAY, 2.0, 3600.0, 0.3),
@@ -65,7 +65,7 @@ def thermal(*, warmed: bool = True) -> ThermalModel:
         coefficient_covariance=np.array([1e-6 * np.eye(len(terms))] * 8),
         leverage_matrix=2e-6 * np.eye(len(terms)),
         discrepancy_px=np.array([0.003, 0.004]),
-        valid=ThermalRange((10.0, 52.0), (-9.0, 9.0), 120.0 if warmed else np.inf),
+        valid=ThermalRange((10.0, 52.0), 120.0 if warmed else np.inf, leverage=5e-6),
         has_warm_up=True,
         candidates=(),
     )

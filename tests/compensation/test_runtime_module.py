@@ -79,6 +79,8 @@ def test_the_exported_file_is_small():
 def test_a_file_that_is_no_runtime_model_is_refused():
     with pytest.raises(ValueError, match="not a drift runtime model"):
         Drift({"format": "thermostand drift model"})
+    with pytest.raises(ValueError, match="of this version; export the model anew"):
+        Drift(runtime_model(thermal()) | {"version": 2})
 
 
 def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_path: Path):
@@ -92,10 +94,10 @@ def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_
             states = States.at_degC(40.0, len(POINTS), two.memory)
             np.testing.assert_array_equal(one.shift(POINTS, states), two.shift(POINTS, states))
     data = json.loads(path.read_text())
-    old = {name: value for name, value in data.items() if name != "other"} | {"schema_version": 2}
-    path.write_text(json.dumps(old))
+    single = {name: value for name, value in data.items() if name != "other"}
+    path.write_text(json.dumps(single))
     assert load_model(path).other is None
-    for changed in ({"camera_serial": "TS-0002"}, {"other": old}):
+    for changed in ({"camera_serial": "TS-0002"}, {"other": single}):
         path.write_text(json.dumps(data | {"other": data["other"] | changed}))
         with pytest.raises(SessionError, match=r"model\.json: not a drift model of this program \(other"):
             load_model(path)

@@ -26,7 +26,7 @@ from std_msgs.msg import Bool
 NAMES = {
     PLACE: "outside the calibrated part of the image",
     CAMERA: "camera's temperature outside the calibrated range",
-    AMBIENT: "air's temperature (in older models also its rate of change) outside the calibrated range",
+    AMBIENT: "air's temperature outside the calibrated range",
     SWITCHED_ON: "switched on too recently",
     HISTORY: "not followed for long enough",
     STATE: "a combination of temperatures that was not calibrated",
