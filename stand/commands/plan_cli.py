@@ -65,7 +65,7 @@ def plan(
         **totals,
         "cameras": [asdict(line) for line in lines],
         "looks": None if looks is None else asdict(looks),
-        "absent": (absent := absences(order.config)),
+        "absent": (absent := [str(each) for each in absences(order.config)]),
     }
     shared = [str(line) for line in lines if line.shared_by > 1]
     seen = [] if looks is None else [str(looks)]

@@ -3,31 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 from stand.config.stand_config import StandConfig
 
 
-def absences(config: StandConfig) -> tuple[str, ...]:
-    """A sentence for each thing that a stand may have and this one has not."""
+class Absence(NamedTuple):
+    """What a stand has not, and what follows from that; as a text both, in a sentence."""
+
+    what: str
+    means: str
+
+    def __str__(self) -> str:
+        return f"no {self.what}: {self.means}"
+
+
+def absences(config: StandConfig) -> tuple[Absence, ...]:
+    """Each thing that a stand may have and this one has not."""
     return tuple(_absences(config))
 
 
-def _absences(config: StandConfig) -> Iterator[str]:
+def _absences(config: StandConfig) -> Iterator[Absence]:
     if config.flap is None:
-        yield "no flap: cameras see the target all the time; what opens or closes it takes no time"
+        yield Absence("flap", "cameras see the target all the time; what opens or closes it takes no time")
     if not config.axes:
-        yield "no stages: a recipe that moves one is refused"
+        yield Absence("stages", "a recipe that moves one is refused")
     if not config.cameras:
-        yield "no cameras: a recipe that takes frames is refused"
+        yield Absence("cameras", "a recipe that takes frames is refused")
     if config.relays is None:
-        yield "no relay board: nothing of the stand's own ends the heat, and cameras stay on"
+        yield Absence("relay board", "nothing of the stand's own ends the heat, and cameras stay on")
     elif "compressor" not in config.relays.channels:
-        yield "no compressor: it cools by losing heat only, so not below the laboratory's temperature"
+        yield Absence("compressor", "it cools by losing heat only, so not below the laboratory's temperature")
     if config.cameras and all(not camera.has_temperature for camera in config.cameras.values()):
-        yield "no camera measures its own temperature: drift is fitted to the air and its history"
+        yield Absence("camera measures its own temperature", "drift is fitted to the air and its history")
     if "granite_inside" not in config.sensors:
-        yield "no thermometer in the granite inside: its drift is not split from the camera's, and it guards nothing"
+        yield Absence(
+            "thermometer in the granite inside", "its drift is not split from the camera's, and it guards nothing"
+        )
     if not config.witnesses:
-        yield "no witness of the air: a regulator's probe and an air thermometer that are wrong alike are not found"
+        yield Absence(
+            "witness of the air", "a regulator's probe and an air thermometer that are wrong alike are not found"
+        )
     if "laboratory" not in config.sensors:
-        yield "no thermometer in the laboratory: a night ends at ending.ambient_degC"
+        yield Absence("thermometer in the laboratory", "a night ends at ending.ambient_degC")

@@ -41,6 +41,7 @@ from stand.running.opening.to_ambient import to_ambient
 from stand.running.order import Order, check_plan
 from stand.running.resume import Interruption, begun, plan_hash
 from stand.running.run_desk import RunDesk
+from stand.running.session_report import DECIDES
 from stand.running.status import StatusBoard
 from stand.serving.api.doors import Interface
 from stand.serving.api.server import preload, serve
@@ -194,7 +195,7 @@ class Guest:
             offsets,
             allowed,
             recorder.lost_of,
-            Decider(recorder.directory, clock).decide,
+            Decider(recorder.directory, clock, DECIDES).decide,
             open_stand.guard.meet,
         )
         leaving.callback(executor.close)

@@ -28,8 +28,8 @@ _REGISTERS, _OPTICS = "registers-{}.yaml", "optics-{}.yaml"  # their names in a 
 class Order:
     """What to run: the checked files and their texts (they are attached to the recording). attended: somebody is there
     to do what the plan prompts for. at_configured_addresses: the laboratory of a virtual run answers there instead of
-    at free addresses, for a program that has to find it. register_texts: the register maps, by names of attachments; a
-    session that was recorded without them has none. commissioning_text: the record of `stand check`, "" without one."""
+    at free addresses, for a program that has to find it. register_texts: the register maps, by names of attachments.
+    commissioning_text: the record of `stand check`, "" without one."""
 
     config: StandConfig
     recipe: Recipe
@@ -109,7 +109,7 @@ def optics_texts(config: StandConfig) -> dict[str, str]:
 
 
 def attached_optics(config: StandConfig, texts: Mapping[str, str]) -> dict[str, str]:
-    """Those of them that are among the attachments of a session; older ones have none."""
+    """Those of them that are among the attachments of a session; built-in optics have none."""
     simulated = () if config.simulation is None else config.simulation.cameras
     return {name: texts[name] for name in map(_OPTICS.format, simulated) if name in texts}
 

@@ -63,9 +63,8 @@ def tell_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
     for device in (*units, *devices.axes.values(), *devices.probes.values()):
         if device is not None and device.identity is not None:
             tell(identity_event(device.name, device.identity, now_ns))
-    for text in absences(assembly.config):
-        what = text.partition(":")[0].removeprefix("no ")
-        tell(Event(now_ns, "info", "absent", text, {"what": what}))
+    for absence in absences(assembly.config):
+        tell(Event(now_ns, "info", "absent", str(absence), {"what": absence.what}))
 
 
 def recorder_of(

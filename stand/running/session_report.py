@@ -1,4 +1,6 @@
-"""The report of a recorded session: the drift fitted, validated at the held-out temperatures, and reported."""
+"""What the stand asks of the compensation: the report of a recorded session (the drift fitted, validated at the
+held-out temperatures, and reported), and the decisions of a cycle that decides. Nothing else of the stand imports it.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +9,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from compensation.design import process
 from experiments.steps import Capture, PlannedStep
 from foundation.errors import ConfigError, StandError
 from foundation.progress import progress
 
 MODEL_NAME, REPORT_NAME = "model.json", "report.html"
+DECIDES = process.__name__  # the module of the process that decides, which imports the rest when it is asked
 
 
 class Reported(NamedTuple):

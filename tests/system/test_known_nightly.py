@@ -10,10 +10,11 @@ from experiments.known import Visit
 from experiments.steps import Capture, Decide
 from foundation.clock import WallClock
 from recording.reading.session import Session
-from stand.running.executing.deciding import MODULE, Decider
+from stand.running.executing.deciding import Decider
 from stand.running.memory.entries import Edited
 from stand.running.order import Order
 from stand.running.run import run_virtual
+from stand.running.session_report import DECIDES
 from tests.journals import read_lines
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 
@@ -50,7 +51,7 @@ async def test_a_night_decides_from_what_it_has_recorded_and_the_same_from_the_s
     assert not by_model[0]
     assert sum(by_model) > 1
     decide = next(planned.step for planned in given.recipe.plan() if isinstance(planned.step, Decide))
-    decider = Decider(session.path, WallClock(), MODULE)
+    decider = Decider(session.path, WallClock(), DECIDES)
     first, second = await decider.decide(decide), await decider.decide(decide)
     assert isinstance(first.answer, Visit)
     assert first == second

@@ -41,7 +41,7 @@ BOARD = packaged("registers", "waveshare-relay")
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One way to fill a place: what it does to the stand's file, and what `absences` then says (its first words)."""
+    """One way to fill a place: what it does to the stand's file, and what `absences` then says ("no flap")."""
 
     name: str
     change: Callable[[Data], object]
@@ -245,7 +245,7 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
     if data["cameras"] and config.relays is None:
         with pytest.raises(ConfigError, match="no relay switches the cameras"):
             check_plan(recipe([{"power_camera": False}]).plan(), config)
-    said = [sentence.partition(":")[0] for sentence in absences(config)]
+    said = [f"no {each.what}" for each in absences(config)]
     expected = [absent for choice in combination for absent in choice.absent]
     if "granite_inside" in data["thermometers"]:  # ours is not controlled by the only one
         expected = [each for each in expected if each not in NO_GRANITE]
@@ -282,8 +282,8 @@ async def test_each_combination_runs_and_records_what_it_lacks(combination: Comb
     session = Session.open(await run_virtual(order, tmp_path / "out", 1, lambda _: None))
     assert session.run == "complete"
     assert len(session.frame_metas) == len(data["cameras"])
-    reported = [event.text.partition(":")[0] for event in session.events() if event.kind == "absent"]
-    assert reported == [sentence.partition(":")[0] for sentence in absences(order.config)]
+    reported = [event.data["what"] for event in session.events() if event.kind == "absent"]
+    assert reported == [each.what for each in absences(order.config)]
     air_degC = session.readings("thermometers.air")[1]
     assert len(air_degC) > 10
     assert all(len(session.readings(f"thermometers.{name}")[1]) == len(air_degC) for name in order.config.sensors)

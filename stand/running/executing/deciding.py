@@ -24,7 +24,6 @@ from foundation.helper import Helper
 from stand.running.memory.entries import Edited, edited
 from stand.running.memory.state import RunState
 
-MODULE = "compensation.design.process"  # by its name: the daemon imports nothing of it
 _LINE, _KEPT = "design", "design"
 
 
@@ -42,9 +41,10 @@ async def fixed_plan(decide: Decide) -> Decided:
 
 
 class Decider:
-    """Of the run whose session is in `directory`. module: of the process."""
+    """Of the run whose session is in `directory`. module: of the process, which has `decided` (compensation/design/
+    process.py)."""
 
-    def __init__(self, directory: Path, clock: Clock, module: str = MODULE) -> None:
+    def __init__(self, directory: Path, clock: Clock, module: str) -> None:
         self._directory = directory
         self._clock = clock
         self._module = module
