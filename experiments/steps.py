@@ -355,15 +355,8 @@ class PlannedStep:
     step: Step
 
 
-# Plans from before soaks were guaranteed keep their ids, so that a run that was interrupted then can be resumed.
-_NOT_IN_IDS: dict[str, tuple[object, ...]] = {"band_K": (0.0, SOAK_BAND_K), "unsettled": ("mark",)}
-
-
 def number_steps(steps: Iterable[Step], first: int = 0) -> Iterator[PlannedStep]:
     """Give each step its place (from `first`) and its id."""
     for index, step in enumerate(steps, first):
-        parameters = parameters_of(step)
-        if isinstance(step, Soak):
-            parameters = {name: value for name, value in parameters.items() if value not in _NOT_IN_IDS.get(name, ())}
-        text = json.dumps([index, kind_of(step), parameters], sort_keys=True)
+        text = json.dumps([index, kind_of(step), parameters_of(step)], sort_keys=True)
         yield PlannedStep(index, hashlib.sha256(text.encode()).hexdigest()[:12], step)

