@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from foundation.clock import VirtualClock, WallClock
+from foundation.errors import SessionError
 from foundation.hub import Hub
 from foundation.items import Event, StepMark, StepState
 from foundation.patience import Patience
@@ -27,7 +31,7 @@ from stand.running.memory.entries import (
 )
 from stand.running.memory.fold import fold
 from stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
-from stand.running.resume import with_recorded
+from stand.running.resume import Interruption, with_recorded
 from tests.journals import read_lines
 from tests.stand.test_run_table import CAPTURE, ID, PLAN, WARM
 
@@ -75,6 +79,18 @@ def test_of_an_instant_in_which_a_capture_is_begun_again_its_end_before_does_not
         again,
         Taken(5, CAPTURE),
     ]
+
+
+def test_a_run_that_is_not_resumed_after_all_is_left_to_others(tmp_path: Path):
+    Journal.create(tmp_path).release()
+    journal, _ = Journal.open(tmp_path)
+    nothing: Any = None
+    before = Interruption(tmp_path, nothing, nothing, journal, fold(PLAN, []), 0, None, (), nothing)
+    with pytest.raises(SessionError, match="is running this session"):
+        Journal.open(tmp_path)
+    before.release()
+    before.release()
+    Journal.open(tmp_path)[0].release()
 
 
 async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp_path: Path):
