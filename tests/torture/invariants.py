@@ -262,7 +262,8 @@ def files_are_readable(evidence: Evidence) -> Iterator[str]:
 
 @invariant(Leg.BOTH)
 def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
-    """What HTTP said was saved, and what captures that are done have to have."""
+    """What HTTP said was saved, and what captures that are done have to have since they were begun last: no more of a
+    camera that nothing has befallen."""
     for (topic, time_ns), count in evidence.frames.items():
         if count > 1:
             yield f"{topic} has the frame at {evidence.at_s(time_ns)} s {count} times"
@@ -274,12 +275,22 @@ def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
             yield f"{run['frames_saved']} frames were saved at {at_s} s, of which {there} are there"
     skipped = {entry.get("step_id") for entry in evidence.journal if entry["entry"] == "Skipped"}
     lost = {said.data.get("step_id") for said in evidence.said if "lost" in said.kind or "dropped" in said.kind}
-    taken = Counter(step_id for _, step_id, _ in evidence.metas)
+    times_ns = {time_ns for _, time_ns in evidence.frames}
+    begun_ns = {said.data["step_id"]: said.time_ns for said in evidence.said if said.kind == "capture_restarted"}
+    taken = Counter(
+        step_id
+        for time_ns, step_id, _ in evidence.metas
+        if time_ns in times_ns and time_ns >= begun_ns.get(step_id, time_ns)
+    )
+    is_lossy = any(said.kind == "camera_lost" for said in evidence.said) or any(
+        fault.name.startswith("camera") for fault in evidence.case.faults
+    )
     for mark in evidence.marks:
         if mark.kind == "Capture" and mark.state == "done" and mark.step_id not in skipped | lost:
             cameras = len(mark.parameters.get("cameras", ())) or len(evidence.stand["cameras"])
-            if evidence.is_complete and taken[mark.step_id] < (wanted := mark.parameters["frames"] * cameras):
-                yield f"the capture {mark.step_id} is done with {taken[mark.step_id]} of {wanted} frames"
+            found, wanted = taken[mark.step_id], mark.parameters["frames"] * cameras
+            if evidence.is_complete and (found < wanted or (found > wanted and not is_lossy)):
+                yield f"the capture {mark.step_id} is done with {found} of {wanted} frames"
 
 
 @invariant(Leg.BOTH)
