@@ -19,7 +19,7 @@ from stand.imaging.equilibrium import LOST, CameraEquilibrium
 from stand.interlock import Interlocked
 from stand.running.executing.camera_gap import OffsetWatch
 from stand.running.executing.deciding import Decider, fixed_plan
-from stand.running.executing.executor import Executor
+from stand.running.executing.executor import Executor, unguarded
 from stand.running.executing.settling_watch import SettlingWatch
 from stand.running.memory.entries import Gap
 from stand.running.memory.fold import fold
@@ -169,9 +169,11 @@ class SmallStand:
 class Life:
     """One daemon, from its start to its death; what it leaves is in `folder`, and what it recorded in `disk`. decides:
     the module of the process that makes the plan's decisions. follows: the chamber is always at its set-point, and says
-    so."""
+    so. gap: that after which it is begun. meet: gets a device error that a step has met."""
 
-    def __init__(self, folder: Path, plan, start_ns, disk, chamber_degC, decides="", *, follows=False):
+    def __init__(
+        self, folder: Path, plan, start_ns, disk, chamber_degC, decides="", *, follows=False, gap=None, meet=unguarded
+    ):
         self.loop = asyncio.new_event_loop()
         self.wrong = []
         self.hub, self.clock = Hub(), VirtualClock(start_ns)
@@ -188,7 +190,7 @@ class Life:
         self._disk, self._unsaved = disk, []
         self._resumes = self._journal_path.exists()
         self._still = ExitStack()  # holds the clock
-        self._follows = follows
+        self._follows, self._gap, self._meet = follows, gap, meet
         self.publish_pv(chamber_degC)
         self.do(self._begin(folder))
 
@@ -214,8 +216,10 @@ class Life:
         self.stand.gate.subscribe(self.log.held)
         stand = cast(Stand, self.stand)  # run_stand.py holds the one against the other
         settling = SettlingWatch(stand, self.hub, self.clock, TARGET)
-        watches = settling, OffsetWatch(self.hub, self.clock)
-        self.executor = Executor(stand, self.hub, self.clock, self.log, self._flushed, *watches, decider=self._decider)
+        watches = settling, OffsetWatch(self.hub, self.clock, self._gap)
+        self.executor = Executor(
+            stand, self.hub, self.clock, self.log, self._flushed, *watches, decider=self._decider, meet=self._meet
+        )
         self._flap = asyncio.create_task(keep_shut_in_holds(stand, self.hub, self.clock))
         self.run = asyncio.create_task(self._run(self.executor))
         if self._follows:
