@@ -12,6 +12,7 @@ from foundation.readings import Reading, bad_reading
 from recording.writing.notices import Notice, SpaceWatch
 from stand.config.stand_config import load_config, packaged
 from stand.fault import Fault
+from stand.gate import OPERATOR
 from stand.guarding.rules import Announcements, natures, watches
 
 
@@ -134,8 +135,14 @@ def test_what_no_probe_and_no_camera_can_be_is_no_measurement():
         assert highest < high < 200.0
 
 
-def test_before_anything_is_said_no_capture_is_under_way_and_frames_are_taken():
+def test_before_anything_is_said_and_after_a_run_no_capture_is_under_way_and_frames_are_taken():
     announced = Announcements()
+    assert (announced.is_capturing, announced.frames_stopped, announced.is_paused) == (False, "", False)
+    announced.receive(mark("Capture", StepState.STARTED))
+    announced.receive(Event(0, "error", "frames_stopped", "the disk is full"))
+    announced.receive(Event(0, "warning", "held", "paused", {"reason": OPERATOR}))
+    assert (announced.is_capturing, announced.frames_stopped, announced.is_paused) == (True, "the disk is full", True)
+    announced.forget()
     assert (announced.is_capturing, announced.frames_stopped, announced.is_paused) == (False, "", False)
 
 
