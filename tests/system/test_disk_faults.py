@@ -230,8 +230,8 @@ def stand(tmp_path_factory):
 def problems(stand, state):
     """What is wrong with how the programs take this state, as sentences."""
     stand.apply(state)
-    content, names = state.hit - state.gone_back, {Path(name).name for name in state.hit}
-    yield from small_files(stand, state, content, names)
+    names = {Path(name).name for name in state.hit}
+    yield from small_files(stand, state, names)
     yield from listed(stand, state)
     for name in (TRIPPED, KILLED):
         hit = {each.removeprefix(f"sessions/{name}/") for each in state.hit if each.startswith(f"sessions/{name}/")}
@@ -240,7 +240,7 @@ def problems(stand, state):
             yield from salvaged(stand, name, hit, state)
 
 
-def small_files(stand, state, content, names):
+def small_files(stand, state, names):
     fault = stand.latch.read()
     if fault is None:
         yield "the latch is lost: the stand would heat"
@@ -262,7 +262,7 @@ def small_files(stand, state, content, names):
         yield f"learned {learned.nights}"
     if learned.nights == ("4",) and learned.overheads_s != {f"soak {n}": float(625 + n) for n in range(20)}:
         yield "what was learned is wrong and nothing says so"
-    yield from queued(stand, state, content, names)
+    yield from queued(stand, names)
     with suppress(ConfigError):
         if load_tokens(stand.tokens) != tokens(4) and "tokens.yaml" not in names:
             yield "tokens that are not damaged are not read"
@@ -277,7 +277,7 @@ def counted(number, name, state):
     return [*true, {}] if name in state.gone_back else true[-1:]
 
 
-def queued(stand, state, content, names):
+def queued(stand, names):
     said = stand.program("queue", "list", "--out", stand.sessions, "--json")
     yield from traceback_in(said)
     its = names & {"queue.json", "queue.json.last"}
@@ -346,7 +346,10 @@ def salvaged(stand, name, hit, state):
     texts = [note.text.strip() for note in notes.notes]
     word = "note" if name == TRIPPED else "word"
     true_texts = [(f"{word} {number} " + "of the night " * 12).strip() for number in range(8)]
-    if texts != [text for text in true_texts if text in texts] or (texts != true_texts and "notes.jsonl" not in hit):
+    is_hit = "notes.jsonl" in hit
+    is_anothers = is_hit and not any(text.startswith(word) for text in texts)  # all of it: it names no session
+    is_wrong = texts != [text for text in true_texts if text in texts] or (texts != true_texts and not is_hit)
+    if is_wrong and not is_anothers:
         yield f"notes of {name}: {[text[:6] for text in texts]}"
     yield from traceback_in(stand.program("session", "info", directory))
 
