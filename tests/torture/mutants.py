@@ -123,6 +123,7 @@ class Copy:
         self._out = folder / f"out-{number}"
         self._modules = folder / f"modules-{number}"
         self._is_prepared = False
+        self._enough: dict[str, float] = {}
         self._env = {"PYTHONPATH": str(self.folder), WORKER: str(12 + number), "TMPDIR": str(folder)}
 
     def found(self, names: str, processor_s: float) -> str:
@@ -143,16 +144,30 @@ class Copy:
             raise OSError(f"{names}: {out[-2000:]}")
         return next(iter(_FAILED.findall(out)), f"{names.partition(' ')[0]} or after it ({tests.exitcode})")
 
-    def with_mistake(self, made: Mutant, stages: list[tuple[str, float]]) -> str:
-        """What finds it of the stages (tests, and how much of the processor's time is enough), "" for nothing."""
+    def with_mistake(self, made: Mutant, stages: list[str]) -> str:
+        """What finds it of the stages, tests that run together; "" for nothing."""
         path = self.folder / made.file
         right = path.read_bytes()
-        path.write_text(made.source, encoding="utf-8")
-        try:
-            return next((found for names, most_s in stages if (found := self.found(names, most_s))), "")
-        finally:
-            path.write_bytes(right)
-            shutil.rmtree(path.parent / "__pycache__", ignore_errors=True)
+        for names in stages:
+            enough_s = self._enough_s(names)
+            path.write_text(made.source, encoding="utf-8")
+            try:
+                found = self.found(names, enough_s)
+            finally:
+                path.write_bytes(right)
+                shutil.rmtree(path.parent / "__pycache__", ignore_errors=True)
+            if found:
+                return found
+        return ""
+
+    def _enough_s(self, names: str) -> float:
+        """How much of the processor's time is enough for these tests; all must pass as it is."""
+        if names not in self._enough:
+            begun_s = _processor_s()
+            if found := self.found(names, _LONGEST_S):
+                raise ValueError(f"{found} fails without any mistake")
+            self._enough[names] = _AT_LEAST_S + _MORE * (_processor_s() - begun_s)
+        return self._enough[names]
 
     def _prepare(self) -> None:
         """Import what the first run has imported of others."""
@@ -204,21 +219,13 @@ def _begin(folder: Path, numbers: SimpleQueue[int]) -> None:
     _here.append(Copy(folder, numbers.get()))
 
 
-def _limited(names: str) -> tuple[str, float]:
-    """How much of the processor's time is enough for these tests; all must pass as it is."""
-    begun_s = _processor_s()
-    if found := _here[0].found(names, _LONGEST_S):
-        raise SystemExit(f"{found} fails without any mistake")
-    return names, _AT_LEAST_S + _MORE * (_processor_s() - begun_s)
-
-
 def _processor_s() -> float:
     """Of what was started from here, and has ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-def _looked(made: Mutant, stages: list[tuple[str, float]]) -> str:
+def _looked(made: Mutant, stages: list[str]) -> str:
     return _here[0].with_mistake(made, stages)
 
 
@@ -245,8 +252,7 @@ def main() -> int:
         tempfile.TemporaryDirectory(prefix="mutants-") as folder,
         ProcessPoolExecutor(given.jobs, context, _begin, (Path(folder), numbers)) as pool,
     ):
-        limits = dict(pool.map(_limited, sorted({names for each in made for names in stages[each.file]})))
-        looks = [pool.submit(_looked, each, [(names, limits[names]) for names in stages[each.file]]) for each in made]
+        looks = [pool.submit(_looked, each, stages[each.file]) for each in made]
         for count, (each, look) in enumerate(zip(made, looks, strict=True), 1):
             found = look.result()
             how[_kind(found)] += 1
