@@ -318,9 +318,12 @@ class RealEvidence(Evidence):
         )
 
     def killed_soon(self, at_s: float, within_s: float) -> bool:
-        """As for virtual time; what wrote for the daemon counts."""
+        """As for virtual time; what wrote for the daemon counts, and a run's end, behind which the process that writes
+        the record between runs has to start."""
+        ends_s = [self.at_s(said.time_ns) for said in self.said if said.kind == "run.end"]
+        deaths_s = [order.at_s for order in self.case.orders if order.verb == "disk_process_killed"]
         return super().killed_soon(at_s, within_s) or any(
-            order.verb == "disk_process_killed" and 0 <= order.at_s - at_s <= within_s for order in self.case.orders
+            0 <= death_s - at_s <= within_s for death_s in (*deaths_s, *(end_s + within_s for end_s in ends_s))
         )
 
     def _spans(self) -> Iterator[tuple[int, int, Life]]:

@@ -88,8 +88,8 @@ class Breaking(FaultSchedule):
 
 def planned(case: Case, now_ns: int, life: int, told: str) -> list[PlannedFault]:
     """What is still to come of the case's faults, or stands, seen from now. An operator who has resumed in vain mends
-    what he was told, of what stands; in the end everything."""
-    if life >= MENDED_AT_LIFE:
+    what he was told, of what stands; in the end everything. In real time they are broken over the control socket."""
+    if life >= MENDED_AT_LIFE or case.is_real:
         return []
     now_s = (now_ns - case.start_ns) / 1e9
     left = [fault for fault in case.faults if fault.at_s + fault.for_s > now_s]

@@ -15,6 +15,7 @@ import random
 import resource
 import shutil
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -30,6 +31,7 @@ import pytest
 import yaml
 
 from drivers.sim.laboratory_faults import FAULTS
+from foundation.addresses import tcp_place
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
 from foundation.errors import SessionError
 from recording.writing.disk import MODULE
@@ -42,7 +44,17 @@ from tests.recording.disks import ext4
 from tests.sections import change
 from tests.stand.floods import FLOODS
 from tests.system.conftest import CORNER
-from tests.torture.case import CHAMBERS, LEFT_OUT, Case, Order, draw_faults, draw_stand, stand_document, write_case
+from tests.torture.case import (
+    CHAMBERS,
+    LEFT_OUT,
+    Case,
+    Fault,
+    Order,
+    draw_faults,
+    draw_stand,
+    stand_document,
+    write_case,
+)
 from tests.torture.doors import Doors
 from tests.torture.laboratory import FOLDER, LIFE
 from tests.torture.lives import HIDDEN, ROOT, Life, find_folder
@@ -307,7 +319,7 @@ class Bench:
     def __init__(self, case: Case, folder: Path, disk: Path) -> None:
         os.environ.setdefault(WORKER, str(os.getpid()))  # cases side by side have ports apart
         self.clock = WallClock()
-        self.case = replace(case, start_ns=self.clock.now_ns())
+        self.case = case
         self.disk, self._folder = disk, folder
         self.port, self.secop = free_port(), free_port()
         self.step_ns = self._offset_ns = self._laboratories = self._daemons = 0
@@ -315,13 +327,12 @@ class Bench:
         self._is_done = self._is_quiet = False
         self.daemon: subprocess.Popen[str]
         self.laboratory: subprocess.Popen[str]
-        (folder / "case.yaml").write_text(write_case(self.case))
+        (folder / "case.yaml").write_text(write_case(case))
         stand = real_document(case, folder)
         (folder / "stand.yaml").write_text(yaml.safe_dump(stand))
         self._spec = laboratory_of(load_config(folder / "stand.yaml"), virtual=False, seed=None)
-        self.doors = Doors(
-            self.case, folder / "doors-0.jsonl", self._server, lambda: stand["bus"]["address"], self.session
-        )
+        self._control = tcp_place(stand["simulation"]["control"])
+        self.doors = Doors(case, folder / "doors-0.jsonl", self._server, lambda: stand["bus"]["address"], self.session)
         for name in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
             (place := folder / name).mkdir(mode=0o700)
             os.environ[name] = str(place)
@@ -331,14 +342,19 @@ class Bench:
             self.write_clocks()
 
     def live(self) -> list[Life]:
-        """All daemons one after the other, while things break."""
+        """All daemons one after the other, while things break; its seconds count from when the first has answered."""
         self.begin_laboratory()
         kills = [Order("kill", at_s) for at_s in self.case.kills_s]
-        breaking = [threading.Thread(target=self._break, args=(order,)) for order in (*self.case.orders, *kills)]
+        works = (*self.case.orders, *self.case.faults, *kills)
+        breaking = [threading.Thread(target=self._break, args=(work,)) for work in works]
         watching = threading.Thread(target=self._watch_lateness)
         lives, end_s = list[Life](), time.monotonic() + LIMIT_S
         self._begin_daemon()
         try:
+            while not self._opened_ns and self.daemon.poll() is None and time.monotonic() < end_s:
+                self._operate()
+                self._over.wait(LOOK_S)
+            self.case, end_s = replace(self.case, start_ns=self.clock.now_ns()), time.monotonic() + LIMIT_S
             for thread in (*breaking, watching):
                 thread.start()
             while True:
@@ -416,9 +432,16 @@ class Bench:
     def _server(self) -> Server:
         return server_of(self.disk / "out")
 
-    def _break(self, order: Order) -> None:
+    def _break(self, order: Order | Fault) -> None:
         at_s = order.at_s - (self.clock.now_ns() - self.case.start_ns) / NS_PER_S
         if self._over.wait(max(0.0, at_s)):
+            return
+        if isinstance(order, Fault):
+            ask = {"do": "break", "name": order.name, "value": order.value, "for_s": order.for_s}
+            with suppress(OSError), socket.create_connection(self._control, 5.0) as control:
+                control.sendall(json.dumps(ask).encode() + b"\n")
+                control.recv(1 << 16)
+            self._over.wait(order.for_s)
             return
         if order.verb == "kill":
             self.daemon.kill()
@@ -441,10 +464,11 @@ class Bench:
         self._daemons += 1
         with self._said.open("w") as file:
             self.daemon = subprocess.Popen(program, cwd=ROOT, env=self._env, stdout=file, stderr=file, text=True)
+        self._begun_ns, self._opened_ns = self.clock.now_ns(), 0
 
     def _life(self, breaking: Sequence[threading.Thread], end_s: float) -> Life:
         """What becomes of the daemon that has been begun."""
-        begun_ns, self._opened_ns, gone_s, is_hung = self.clock.now_ns(), 0, math.inf, False
+        gone_s, is_hung = math.inf, False
         while self.daemon.poll() is None:
             self._is_quiet = not any(thread.is_alive() for thread in breaking)
             if time.monotonic() > gone_s:
@@ -460,7 +484,7 @@ class Bench:
                 self._operate()
                 self._over.wait(LOOK_S)
         status = None if is_hung else self.daemon.returncode
-        times_ns = (begun_ns, self._opened_ns, self.clock.now_ns(), self._offset_ns)
+        times_ns = (self._begun_ns, self._opened_ns, self.clock.now_ns(), self._offset_ns)
         return Life([], status, "", self._said.read_text(errors="replace"), *times_ns)
 
     def _operate(self) -> None:
