@@ -21,6 +21,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -116,11 +117,9 @@ def kind(*lasts_s: float, means: tuple[str, ...] = ()) -> Callable[[Does], Does]
 @kind(0.5, 2.0, 5.0, 12.0)
 def daemon_stopped(bench: Bench, order: Order) -> Iterator[None]:
     """Shorter and longer than the relay's time."""
-    daemon = bench.daemon
-    daemon.send_signal(signal.SIGSTOP)
-    bench.doors.note(order, bench.now_ns(), None)
-    yield
-    daemon.send_signal(signal.SIGCONT)
+    with bench.stopped(bench.daemon.pid):
+        bench.doors.note(order, bench.now_ns(), None)
+        yield
 
 
 @kind()
@@ -137,10 +136,8 @@ def disk_process_killed(bench: Bench, order: Order) -> Iterator[None]:
 
 @kind(1.0, 4.0, 10.0)
 def disk_process_stopped(bench: Bench, order: Order) -> Iterator[None]:
-    pid = bench.drawn(order, bench.disk_processes())
-    os.kill(pid, signal.SIGSTOP)
-    yield
-    os.kill(pid, signal.SIGCONT)
+    with bench.stopped(bench.drawn(order, bench.disk_processes())):
+        yield
 
 
 EVERY_DEVICE = ("bus", "relays", "chamber", "flap", "thermometer", "camera", "regulator", "heater", "heat_module")
@@ -149,10 +146,8 @@ EVERY_DEVICE = ("bus", "relays", "chamber", "flap", "thermometer", "camera", "re
 @kind(1.0, 4.0, 10.0, means=EVERY_DEVICE)
 def laboratory_stopped(bench: Bench, order: Order) -> Iterator[None]:
     """No device answers."""
-    laboratory = bench.laboratory
-    laboratory.send_signal(signal.SIGSTOP)
-    yield
-    laboratory.send_signal(signal.SIGCONT)
+    with bench.stopped(bench.laboratory.pid):
+        yield
 
 
 @kind(0.5, 5.0, means=EVERY_DEVICE)
@@ -325,6 +320,7 @@ class Bench:
         self.step_ns = self._offset_ns = self._laboratories = self._daemons = 0
         self._over, self._late_s, self._opened_ns = threading.Event(), 0.0, 0
         self._is_done = self._is_quiet = False
+        self._stopped = Counter[int]()
         self.daemon: subprocess.Popen[str]
         self.laboratory: subprocess.Popen[str]
         (folder / "case.yaml").write_text(write_case(case))
@@ -392,6 +388,16 @@ class Bench:
         children = [path.read_text().split() for path in Path(f"/proc/{self.daemon.pid}/task").glob("*/children")]
         pids = {int(pid) for pid in itertools.chain(*children)}
         return sorted(pid for pid in pids if MODULE in Path(f"/proc/{pid}/cmdline").read_text().split("\0"))
+
+    @contextmanager
+    def stopped(self, pid: int) -> Iterator[None]:
+        """A process stands still until all who have stopped it let it go on."""
+        self._stopped[pid] += 1
+        os.kill(pid, signal.SIGSTOP)
+        yield
+        self._stopped[pid] -= 1
+        if not self._stopped[pid]:
+            os.kill(pid, signal.SIGCONT)
 
     def freeze(self, how: str) -> None:
         """-f or -u."""
