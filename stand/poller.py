@@ -16,6 +16,7 @@ from foundation.items import Batch, Event
 from foundation.readings import Cause, Reading, bad_reading
 
 _AGAIN_S = 1.0  # after a poll that failed on the wire
+_FAST_AFTER_NS = 600 * NS_PER_S
 
 
 @dataclass
@@ -25,7 +26,8 @@ class Poller:
     `first()` must succeed before `run()`: what it returns defines which channels to declare BAD when a later read
     fails; a device that has nothing new gives none, and none are published. mark: what is published of the readings of
     a poll at an instant (ns); it may mark some as STALE. A device whose read takes longer than the period is an event,
-    and one more when it is within half a period again.
+    and one more when it was within half a period for ten minutes: a line that is slow now and then is said six times
+    an hour at most.
     """
 
     sensor: Sensor
@@ -37,7 +39,7 @@ class Poller:
     def __post_init__(self) -> None:
         self._known: tuple[Reading, ...] = ()
         self._failing = False
-        self._lost_ns = 0
+        self._lost_ns = self._slow_ns = 0
         self._is_slow = False
         self._ask_again = False
 
@@ -74,18 +76,20 @@ class Poller:
 
     def _time(self, took_ns: int) -> None:
         """Of one read that succeeded."""
-        took_s, name = round(took_ns / NS_PER_S, 3), self.sensor.name
+        took_s, name, now_ns = round(took_ns / NS_PER_S, 3), self.sensor.name, self.clock.now_ns()
+        if took_s > self.period_s / 2:
+            self._slow_ns = now_ns
         if not self._is_slow and took_s <= self.period_s:
             return
         data: dict[str, object] = {"device": name, "took_s": took_s, "period_s": self.period_s}
         if not self._is_slow:
             self._is_slow = True
             text = f"{name} took {took_s:g} s to answer and is read every {self.period_s:g} s: readings are missing"
-            self.hub.publish(Event(self.clock.now_ns(), "warning", "device_slow", text, data))
-        elif took_s < self.period_s / 2:
+            self.hub.publish(Event(now_ns, "warning", "device_slow", text, data))
+        elif now_ns - self._slow_ns >= _FAST_AFTER_NS:
             self._is_slow = False
             text = f"{name} answers within {took_s:g} s again"
-            self.hub.publish(Event(self.clock.now_ns(), "info", "device_fast", text, data))
+            self.hub.publish(Event(now_ns, "info", "device_fast", text, data))
 
     def _publish(self, readings: tuple[Reading, ...]) -> None:
         if not readings:

@@ -43,8 +43,19 @@ async def test_a_device_that_is_slower_than_its_period_is_an_event_once_and_when
     device = Slow(clock)
     poller = Poller(cast(Sensor, device), 1.0, hub, clock)
     await poller.first()
-    for takes_s in (0.9, 1.2, 1.5, 0.8, 0.4, 0.4):
+    for takes_s, rests_s in (
+        (0.9, 0),
+        (1.2, 0),
+        (1.5, 0),
+        (0.8, 0),
+        (0.4, 0),
+        (1.1, 0),
+        (0.4, 400),
+        (0.4, 300),
+        (0.4, 0),
+    ):
         device.takes_s = takes_s
+        clock.advance_ns(round(rests_s * 1e9))
         await poller.poll()
     assert [(event.kind, event.data["took_s"]) for event in events] == [("device_slow", 1.2), ("device_fast", 0.4)]
     assert events[0].text.startswith("thermometers took 1.2 s to answer and is read every 1 s")
