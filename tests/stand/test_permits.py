@@ -165,6 +165,7 @@ async def test_a_relay_that_is_off_before_its_time_was_dropped_unless_its_time_i
         bench.board.others_switch(HEATER, False)
         await bench.keep(30.0)
         assert not any("compressor" in event.text for event in bench.events)
+        assert all(f"off {left_s:.1f} s before its time" in event.text for event in bench.events)
         assert bench.told() == told
         assert bench.board.is_on(HEATER)
 
