@@ -100,6 +100,18 @@ def test_beside_a_finished_segment_with_other_messages_the_part_is_kept(damaged,
     assert read_segment(done.path) == night[1][TELEMETRY, "finished"].messages
 
 
+def test_of_a_part_that_shares_some_frames_with_its_finished_segment_these_are_counted(tmp_path):
+    folder, shared = tmp_path / "night" / FRAMES, 10
+    write_segment(folder, FRAMES, range(20))
+    salvage_session(folder.parent)
+    write_segment(folder, FRAMES, range(20 - shared, 30))
+    (folder / "0001.mcap.part").replace(folder / "0000.mcap.part")
+    (done,) = salvage_session(folder.parent)
+    assert done.messages == shared
+    assert done.reason.startswith(f"holds {shared} messages that 0000.mcap does not hold")
+    assert done.kept == folder / "0000.mcap.damaged"
+
+
 def test_a_living_recording_is_left_alone(damaged):
     folder, path, written = damaged(FRAMES, lambda data: data[:-5])
     with path.open("rb") as file:
