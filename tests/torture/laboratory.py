@@ -86,17 +86,22 @@ class Breaking(FaultSchedule):
             super()._set(name, value)
 
 
-def planned(case: Case, now_ns: int, life: int, told: str) -> list[PlannedFault]:
+def planned(case: Case, now_ns: int, folder: Path, life: int) -> list[PlannedFault]:
     """What is still to come of the case's faults, or stands, seen from now. An operator who has resumed in vain mends
-    what he was told, of what stands; in the end everything. In real time they are broken over the control socket."""
+    what he was told, of what stood until then; in the end everything. In real time they are broken over the control
+    socket."""
     if life >= MENDED_AT_LIFE or case.is_real:
         return []
-    now_s = (now_ns - case.start_ns) / 1e9
+    told = "".join((folder / f"said-{number}.txt").read_text() for number in range(1, life))
+    path = folder / f"truth-{life - 1}.bin"
+    before = path.read_bytes()[-ROW.size :] if path.exists() else b""
+    until_ns = max(now_ns, ROW.unpack(before)[0] if before else 0)
+    now_s, until_s = ((time_ns - case.start_ns) / 1e9 for time_ns in (now_ns, until_ns))
     left = [fault for fault in case.faults if fault.at_s + fault.for_s > now_s]
     return [
         PlannedFault(each.name, each.value, max(0.0, each.at_s - now_s), each.for_s - max(0.0, now_s - each.at_s))
         for each in left
-        if each.at_s > now_s or not is_named(each, told)
+        if each.at_s > until_s or not is_named(each, told)
     ]
 
 
@@ -113,8 +118,7 @@ def main() -> int:
     life, case = int(os.environ[LIFE]), read_case(folder / "case.yaml")
     (begun := folder / f"begun-{life}").touch()
     laboratory = ObservedLaboratory(spec, folder, life)
-    told = "".join((folder / f"said-{number}.txt").read_text() for number in range(1, life))
-    schedule = Breaking(laboratory, planned(case, laboratory.now_ns, life, told))
+    schedule = Breaking(laboratory, planned(case, laboratory.now_ns, folder, life))
     control = serve_control(laboratory, schedule, ending.ask)
     print(json.dumps({**laboratory.addresses, "control": control.address}), flush=True)  # noqa: T201 - as drivers.sim
     while not ending.wait(0.1) and os.getppid() == parent:
