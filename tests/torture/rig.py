@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tests.torture.case import Case, draw, smaller, steps_of
 from tests.torture.evidence import Evidence, RealEvidence
@@ -19,8 +20,8 @@ from tests.torture.real import draw_real, live_real
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of a case. simulated_s: over all lives. events, rules of the guard,
-    entries of the journal: how often each was recorded."""
+    """What came of a case. simulated_s: over all lives. events, rules of the guard: how often each was recorded.
+    journal: its entries. steps: the kind of each step by its id."""
 
     case: Case
     lives: tuple[Life, ...]
@@ -28,7 +29,8 @@ class Result:
     simulated_s: float
     events: Counter[str]
     rules: Counter[str]
-    entries: Counter[str]
+    journal: list[dict[str, Any]]
+    steps: dict[str, str]
 
     @property
     def broken(self) -> set[str]:
@@ -48,11 +50,11 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
         events = Counter(said.kind for said in evidence.said)
         trips = [said for said in evidence.said if said.kind.startswith("guard.") and "rule" in said.data]
         rules = Counter(str(said.data["rule"]) for said in trips)
-        entries = Counter(str(each["entry"]) for each in evidence.journal)
+        steps = {mark.step_id: mark.kind for mark in evidence.marks}
         found = tuple(violations(evidence))
         if twice and not case.kills_s and all(life.status is not None for life in evidence.lives):
             found += tuple(_differing(case, place, left))
-        return Result(case, tuple(evidence.lives), found, sum(spans_ns) / 1e9, events, rules, entries)
+        return Result(case, tuple(evidence.lives), found, sum(spans_ns) / 1e9, events, rules, evidence.journal, steps)
     finally:
         if folder is None:
             shutil.rmtree(place, ignore_errors=True)

@@ -188,7 +188,7 @@ def test_a_broken_case_is_shrunk_to_what_breaks_it(
     orders = tuple(Order(verb, 3.0) for verb in ("pause", "continue", "stop", "clear", "note", "state"))
     case = replace(draw(3), faults=faults, orders=orders, kills_s=(9.0, 11.0, 12.0), attended=True)
     case = replace(case, stand={**case.stand, "cameras": "2 cameras", "heat": "cts"})
-    monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter(), Counter()))
+    monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter(), [], {}))
     monkeypatch.setattr(rig.Result, "broken", property(lambda self: is_broken(self.case)))
     least = shrunk(case, {"x"}, tries)
     assert {fault.name for fault in least.faults} == {name for name in names if name in needed}
