@@ -243,6 +243,11 @@ class Evidence:
                     quality = kind.enum_type.values_by_number[getattr(message, kind.name)].name
                     row = (time_ns, value, quality)
                     self.temperatures.setdefault(described.name.removesuffix("_degC"), []).append(row)
+            for remark in message.remarks:
+                name = remark.channel.partition(".")[2]
+                if remark.unit == "degC" and f"{name}_degC" not in message.DESCRIPTOR.fields_by_name:
+                    kind = remark.DESCRIPTOR.fields_by_name["quality"].enum_type.values_by_number[remark.quality]
+                    self.temperatures.setdefault(name, []).append((remark.time_ns, remark.value, kind.name))
 
 
 class RealEvidence(Evidence):

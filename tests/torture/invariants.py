@@ -347,7 +347,7 @@ def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
         readings = row["answer"].get("readings", {}) if isinstance(row["answer"], dict) else {}
         for channel, shown in readings.items():
             device, _, name = channel.partition(".")
-            if device != "thermometers" or name not in evidence.temperatures or shown["quality"] != "good":
+            if device != "thermometers" or shown["unit"] != "degC" or shown["quality"] != "good":
                 continue
             at_s, time_ns = evidence.at_s(shown["time_ns"]), shown["time_ns"]
             first = bisect.bisect_left(recorded[name], (time_ns, -math.inf))
