@@ -350,9 +350,10 @@ def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
             if device != "thermometers" or shown["unit"] != "degC" or shown["quality"] != "good":
                 continue
             at_s, time_ns = evidence.at_s(shown["time_ns"]), shown["time_ns"]
-            first = bisect.bisect_left(recorded[name], (time_ns, -math.inf))
-            last = bisect.bisect_right(recorded[name], (time_ns + evidence.batch_ns, math.inf))
-            values = [value for _, value in recorded[name][first:last]]
+            rows = recorded.get(name, [])
+            first = bisect.bisect_left(rows, (time_ns, -math.inf))
+            last = bisect.bisect_right(rows, (time_ns + evidence.batch_ns, math.inf))
+            values = [value for _, value in rows[first:last]]
             is_there = any(abs(value - shown["value"]) < 1e-6 for value in values)
             if not is_there and not evidence.killed_soon(at_s, DURABLE_S):
                 yield f"HTTP showed {channel} {shown['value']:.3f} of {at_s} s, the recording has {values}"
