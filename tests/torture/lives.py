@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import subprocess
@@ -18,7 +17,7 @@ from tests.torture.case import Case, stand_document, write_case
 
 ROOT = Path(__file__).parents[2]
 MOST_LIVES = 10
-REAL_S = float(os.environ.get("TORTURE_REAL_S", "400"))  # of one life: a longer one hangs
+STILL_S, MOST_LOOKS = 240.0, 20  # a life hangs when the plant's time does not pass between two looks, of the host
 _LABORATORY_S, _LOOK_S = 20.0, 0.02  # that of a program that was killed writes down what comes after
 HIDDEN = "hidden"  # where a session's folder is that was lost
 KILLED, COMPLETE, BAD_INPUT = -9, 0, 2
@@ -76,21 +75,31 @@ def find_folder(folder: Path) -> bool:
 def _life(folder: Path, number: int, command: list[str]) -> Life:
     program = [sys.executable, "-m", "tests.torture.product", str(folder), str(number), *command]
     process = forked.popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    status: int | None = None
-    try:
-        out, err = process.communicate(timeout=REAL_S)
-        status = process.returncode
-    except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGUSR1)  # it says where it is
-        _wait(1.0)
-        process.kill()
-        out, err = process.communicate()
+    status, out, err = _ended(process, folder / f"truth-{number}.bin")
     (folder / f"said-{number}.txt").write_text(out + err)
     for _ in range(round(_LABORATORY_S / _LOOK_S)):
         if not (folder / f"begun-{number}").exists():
             break
         _wait(_LOOK_S)
     return Life(command, status, out, err)
+
+
+def _ended(process: subprocess.Popen[str], truth: Path) -> tuple[int | None, str, str]:
+    """Its status, None for one that hung, and what it said."""
+    size = -1
+    for _ in range(MOST_LOOKS):
+        try:
+            out, err = process.communicate(timeout=STILL_S)
+        except subprocess.TimeoutExpired:
+            before, size = size, truth.stat().st_size if truth.exists() else 0
+            if size == before:
+                break
+        else:
+            return process.returncode, out, err
+    process.send_signal(signal.SIGUSR1)  # it says where it is
+    _wait(1.0)
+    process.kill()
+    return None, *process.communicate()
 
 
 def _wait(real_s: float) -> None:
