@@ -44,7 +44,8 @@ class Case:
     """stand: the choice at each place of tests.system.test_stand_combinations.PLACES. plan: a recipe's steps or
     experiments. kills_s: when the program is killed; each time its run is resumed. drawn_order: sleepers with one
     deadline, and tasks ready at one wake, run in an order drawn from the seed. is_real: in real time, see real.py.
-    start_ns: the instant from which its seconds count."""
+    start_ns: the instant from which its seconds count. settings: of sections of the stand's file, beside
+    the usual ones."""
 
     seed: int
     stand: dict[str, str]
@@ -58,6 +59,7 @@ class Case:
     kills_s: tuple[float, ...] = ()
     is_real: bool = False
     start_ns: int = START_NS
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 PLAIN = {
@@ -171,7 +173,16 @@ def draw(seed: int) -> Case:
         faults=tuple(draw_faults(drawn, stand, left & KINDS.keys(), duration_s, LASTS_S, MOST_FAULTS)),
         orders=tuple(_orders(drawn, left, duration_s)),
         kills_s=_kills(drawn, left, duration_s),
+        settings=_settings(random.Random(f"settings {seed}"), stand),
     )
+
+
+def _settings(drawn: random.Random, stand: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """Those without which some rules and events are out of a drawn case's reach."""
+    wet = {"dew": {"humidity_percent": 70}} if stand["thermometers"] == "5" else {}
+    guard = drawn.choice(({}, {"disk_low_s": 60.0}, {"pause_limit_h": 0.1}, {"flap_open_s": 10.0}))
+    settings = {"guard": guard, "ending": drawn.choice(({}, {"to_ambient": True, "max_s": 1800.0}))}
+    return {name: values for name, values in (settings | drawn.choice(({}, wet))).items() if values}
 
 
 def draw_stand(drawn: random.Random) -> dict[str, str]:
@@ -286,10 +297,12 @@ def stand_document(case: Case, folder: Path) -> dict[str, Any]:
     data["simulation"] |= laboratory
     if "imager" in data:
         data["imager"]["folder"] = str(folder / "pictures")
+    for section, values in case.settings.items():
+        data[section] = {**data.get(section, {}), **values}
     return data
 
 
-_PLAINER = {"drawn_order": False, "chamber_seed": None, "attended": False, "laboratory_degC": 24.0}
+_PLAINER = {"drawn_order": False, "chamber_seed": None, "attended": False, "laboratory_degC": 24.0, "settings": {}}
 
 
 def smaller(case: Case) -> Iterator[tuple[str, Case]]:
