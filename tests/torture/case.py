@@ -180,7 +180,7 @@ def draw(seed: int) -> Case:
 def _settings(drawn: random.Random, stand: dict[str, str]) -> dict[str, dict[str, Any]]:
     """Those without which some rules and events are out of a drawn case's reach."""
     wet = {"dew": {"humidity_percent": 70}} if stand["thermometers"] == "5" else {}
-    guard = drawn.choice(({}, {"disk_low_s": 60.0}, {"pause_limit_h": 0.1}, {"flap_open_s": 10.0}))
+    guard = drawn.choice(({}, {"disk_low_s": 60.0}, {"pause_limit_h": 0.1}, {"flap_open_s": 60.0}))
     settings = {"guard": guard, "ending": drawn.choice(({}, {"to_ambient": True, "max_s": 1800.0}))}
     return {name: values for name, values in (settings | drawn.choice(({}, wet))).items() if values}
 
