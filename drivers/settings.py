@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field
 
 from foundation.documents import Document
 from foundation.errors import DeviceFault
+from foundation.events import DEVICE_IDENTITY
 from foundation.items import Event
 
 DeviceName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]  # the first part of its channels
@@ -128,10 +129,10 @@ def identity_event(device: str, identity: Identity, now_ns: int, camera: CameraS
     """With the device's name, what it tells of itself, and of a camera the lens that its settings state ("" when they
     do not)."""
     data: dict[str, object] = {"device": device, **asdict(identity)}
-    text = f"{device}: {identity}"
+    said = str(identity)
     if not identity.serial_number:
-        text += "; it tells no serial number"
+        said += "; it tells no serial number"
     if camera is not None:
         data["lens"] = camera.lens
-        text += f", lens {camera.lens}" if camera.lens else ", its lens is not stated"
-    return Event(now_ns, "info", "device_identity", text, data)
+        said += f", lens {camera.lens}" if camera.lens else ", its lens is not stated"
+    return DEVICE_IDENTITY.at(now_ns, said, **data)

@@ -126,26 +126,29 @@ def event(
     """One more row; see EventKind. ValueError when there is one of that name."""
     if name in KINDS:
         raise ValueError(f"there is an event {name} already")
-    row = EventKind(name)
+    KINDS[name] = row = EventKind(name)
     row.level, row.text, row.advice, row.alert = level, text, advice, alert
     row.counts, row.is_shown, row.cases = counts, is_shown, cases
-    KINDS[name] = row
     return row
 
 
 def guard_rule(name: str, says: str, warned: str = "") -> str:
-    """The row `guard.NAME` of a rule, whose action decides what follows; returns the name. says: what it objects to, in
-    general; warned: the advice where the rule only warns."""
-
-    def advice(data: Data) -> str:
-        return _after_guard(data) or warned
+    """Adds the row `guard.NAME` of a rule, whose action decides what follows; returns the name. says: what it objects
+    to, in general; warned: the advice where the rule only warns."""
 
     def text(said: str, **_: object) -> str:
         return said
 
     text.__doc__ = says
-    event(GUARD + name, _level_of_guard, text, advice, alert=_alert_of_guard)
+    event(GUARD + name, _level_of_guard, text, lambda data: _after_guard(data) or warned, alert=_alert_of_guard)
     return name
+
+
+def guard_kind(rule: str) -> EventKind:
+    """The row of a rule; one that has none gets one: what trips is always said."""
+    if GUARD + rule not in KINDS:
+        guard_rule(rule, "")
+    return KINDS[GUARD + rule]
 
 
 def advice_for(kind: str, data: Data, session: str = "") -> str:
@@ -196,6 +199,8 @@ _ELSE = "`stand status` shows how it stands"  # of kinds of another version, or 
 _TRIPPED = "once the cause is removed, `stand clear` where a daemon has the stand, else `stand resume {folder} --clear`"
 
 
+# A table: a row has as many lines as it needs.
+# fmt: off
 # The guard. What it does depends on the rule's action, not on the rule.
 def _level_of_guard(data: Data) -> Level:
     return "warning" if data.get("action") == "warn" else "error"
@@ -226,40 +231,19 @@ def _hold_ended(said: str, rule: str, endings_in_last_h: int | None = None) -> s
 
 HOLD_ENDED = event("hold_ended", "warning", _hold_ended, _NOTHING, alert=Alert("hold", "guard", "over"), counts=True)
 HOLD_STAYS = event("hold_stays", "error", "{said}", CLEAR, alert=Alert("hold", "guard"), counts=True)
-GUARD_LATE = event(
-    "guard_late",
-    "warning",
+GUARD_LATE = event("guard_late", "warning",
     "the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up",
-    "see what stopped or loads this computer; " + _SLEEP,
-)
-SENSOR_BELIEVED = event(
-    "sensor_believed",
-    "info",
-    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {doubted_s:.0f} s in doubt: {said}",
-)
-LATCH_NOT_KEPT = event(
-    "latch_not_kept",
-    "error",
-    "that the stand has tripped may be forgotten at a restart: {said}",
-    "see that the folder of the stand's state is there and has room",
-)
-LATCH_NOT_CLEARED = event(
-    "latch_not_cleared",
-    "warning",
-    "at a restart the stand is taken for tripped: {said}",
-    "`stand clear` again, when the disk answers",
-)
-LIMITS_ACCEPTED = event(
-    "limits_accepted", "warning", "{said}", "take `guard.accept` out of the stand's file when that is not wanted"
-)
-NOT_CONFIRMED_SAFE = event(
-    "not_confirmed_safe",
-    "error",
-    "{said}",
-    "switch the stand off by hand; `stand status` says when it is safe",
-    alert=Alert("trip", "unsafe"),
-    counts=True,
-)
+    "see what stopped or loads this computer; " + _SLEEP)
+SENSOR_BELIEVED = event("sensor_believed", "info",
+    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {doubted_s:.0f} s in doubt: {said}")
+LATCH_NOT_KEPT = event("latch_not_kept", "error", "that the stand has tripped may be forgotten at a restart: {said}",
+    "see that the folder of the stand's state is there and has room")
+LATCH_NOT_CLEARED = event("latch_not_cleared", "warning", "at a restart the stand is taken for tripped: {said}",
+    "`stand clear` again, when the disk answers")
+LIMITS_ACCEPTED = event("limits_accepted", "warning", "{said}",
+    "take `guard.accept` out of the stand's file when that is not wanted")
+NOT_CONFIRMED_SAFE = event("not_confirmed_safe", "error", "{said}",
+    "switch the stand off by hand; `stand status` says when it is safe", alert=Alert("trip", "unsafe"), counts=True)
 CONFIRMED_SAFE = event("confirmed_safe", "info", "the stand is safe", alert=Alert("trip", "unsafe", "over"))
 NOTIFY_FAILED = event("notify_failed", "warning", "{said}", _TRY_ALERTS)
 ALERT_FAILED = event("alert_failed", "warning", "an alert was not delivered: {said}", "`stand alert test` tries them")
@@ -281,53 +265,30 @@ COMPRESSOR_NOT_ON = event("compressor_not_on", "warning", _OFF, _NOT_ON)
 _DROPPED = "{device}.{relay} is off {left_s:.1f} s before its time: something else switched it"
 _SUPPLY = "look at the relay board's supply; " + _SWITCHED
 HEATER_DROPPED = event("heater_enable_dropped", "warning", _DROPPED, _SUPPLY)
-COMPRESSOR_DROPPED = event(
-    "compressor_dropped", "warning", _DROPPED + "; it counts as a stop, and the compressor rests", _SUPPLY
-)
-COMPRESSOR = event("compressor", "info", "compressor {said}")
-COMPRESSOR_NOT_KEPT = event(
-    "compressor_not_kept", "warning", "the next start will not know when the compressor last ran: {said}", _SEE_DISK
-)
-PERMIT_NOT_RENEWED = event(
-    "permit_not_renewed",
-    "warning",
-    "heating and cooling permits not renewed: {said}",
-    "heat and cold drop by themselves until it answers; " + CONNECTED,
-)
-REGULATOR_OCCUPIED = event(
-    "regulator_occupied",
-    "warning",
-    "{said}; the run waits",
-    "end at the unit what occupies it: autotuning, a program of its own, local mode",
-)
+COMPRESSOR_DROPPED = event("compressor_dropped", "warning",
+    _DROPPED + "; it counts as a stop, and the compressor rests", _SUPPLY)
+COMPRESSOR_SWITCHED = event("compressor", "info", "compressor {said}")
+COMPRESSOR_NOT_KEPT = event("compressor_not_kept", "warning",
+    "the next start will not know when the compressor last ran: {said}", _SEE_DISK)
+PERMIT_NOT_RENEWED = event("permit_not_renewed", "warning", "heating and cooling permits not renewed: {said}",
+    "heat and cold drop by themselves until it answers; " + CONNECTED)
+REGULATOR_OCCUPIED = event("regulator_occupied", "warning", "{said}; the run waits",
+    "end at the unit what occupies it: autotuning, a program of its own, local mode")
 AUTOTUNED = event("autotuned", "info", "{device} is tuned at {set_point_degC:g} degC; in the stand's file: {said}")
-NO_DEAD_MAN = event(
-    "no_dead_man",
-    "warning",
+NO_DEAD_MAN = event("no_dead_man", "warning",
     "no relay board guards the heat; when this computer dies, what ends it is {ends_it}",
-    "see that a hard-wired cut-out is in the heater's line: docs/safety.md",
-)
-DEAD_MAN_LATE = event(
-    "dead_man_late",
-    "warning",
+    "see that a hard-wired cut-out is in the heater's line: docs/safety.md")
+DEAD_MAN_LATE = event("dead_man_late", "warning",
     "{device}: this computer was held up while the relay's timer was tested; that test does not count",
-    "it is tested again by itself; see what loads this computer when that is so at each start",
-)
-DEAD_MAN_TESTED = event(
-    "dead_man_tested",
-    lambda data: "info" if data.get("rearmed") and data.get("dropped") else "error",
-    "{device}: {said}",
+    "it is tested again by itself; see what loads this computer when that is so at each start")
+DEAD_MAN_TESTED = event("dead_man_tested",
+    lambda data: "info" if data.get("rearmed") and data.get("dropped") else "error", "{device}: {said}",
     "take a board whose timed-on each command restarts (docs/drivers.md); `stand check --moves`",
-    cases=({"rearmed": True, "dropped": True}, {"dropped": False}),
-)
+    cases=({"rearmed": True, "dropped": True}, {"dropped": False}))
 TO_AMBIENT = event("to_ambient", "info", "the plan is done; back to {ambient_degC:.1f} degC: {said}")
 AT_AMBIENT = event("at_ambient", "info", "the chamber is at the laboratory's temperature")
-NOT_AT_AMBIENT = event(
-    "not_at_ambient",
-    "warning",
-    "after {after_s:min} min {said}; open the chamber with care",
-    "`stand status` shows when the air is as warm as the laboratory",
-)
+NOT_AT_AMBIENT = event("not_at_ambient", "warning", "after {after_s:min} min {said}; open the chamber with care",
+    "`stand status` shows when the air is as warm as the laboratory")
 
 
 # Devices.
@@ -337,109 +298,60 @@ def _device(phase: Phase) -> Callable[[Data], Alert]:
 
 DEVICE_LOST = event("device_lost", "warning", "{said}", CONNECTED, alert=_device("lasting"), counts=True)
 DEVICE_BACK = event("device_back", "info", "{device} answers again after {lost_s:g} s", alert=_device("over"))
-DEVICE_SLOW = event(
-    "device_slow",
-    "warning",
+DEVICE_SLOW = event("device_slow", "warning",
     "{device} took {took_s:g} s to answer and is read every {period_s:g} s: readings are missing",
-    "look at its line: speed, cable, how many units are on it; `stand check` times each device",
-    counts=True,
-)
+    "look at its line: speed, cable, how many units are on it; `stand check` times each device", counts=True)
 DEVICE_FAST = event("device_fast", "info", "{device} answers within {took_s:g} s again")
 DEVICE_IDENTITY = event("device_identity", "info", "{device}: {said}")
-ABSENT = event("absent", "info", "{said}")
+ABSENT = event("absent", "info", "no {what}: {said}")
 BY_HAND_FAILED = event("by_hand_failed", "warning", "{what}: {said}", CONNECTED)
-FLAP_NOT_SHUT = event(
-    "flap_not_shut",
-    "error",
-    "the flap does not close, although the run is held ({reasons}): {said}",
-    "see what blocks the flap, or close it by hand",
-    alert=Alert("hold", "flap"),
-)
+FLAP_NOT_SHUT = event("flap_not_shut", "error", "the flap does not close, although the run is held ({reasons}): {said}",
+    "see what blocks the flap, or close it by hand", alert=Alert("hold", "flap"))
 FLAP_SHUT_IN_HOLD = event("flap_shut_in_hold", "info", "the flap was shut: the run is held ({reasons})")
-HOMED = event(
-    "homed",
-    "warning",
-    "{axis} had lost its scale and was homed; captures since its last home are suspect",
-    _STAGE + _CAREFUL,
-)
+HOMED = event("homed", "warning", "{axis} had lost its scale and was homed; captures since its last home are suspect",
+    _STAGE + _CAREFUL)
 _HOME = "{axis}: home was at {residual:.5f} {unit} ({steps:.2f} steps)"
 HOME_RESIDUAL = event("home_residual", "info", _HOME)
-HOME_RESIDUAL_LARGE = event(
-    "home_residual_large",
-    "warning",
-    _HOME + ", more than {limit_steps:g} steps; captures since its last good home are suspect",
-    _STAGE + _CAREFUL,
-)
+HOME_RESIDUAL_LARGE = event("home_residual_large", "warning",
+    _HOME + ", more than {limit_steps:g} steps; captures since its last good home are suspect", _STAGE + _CAREFUL)
 RE_APPROACHED = event("re-approached", "info", "{axis}: {reason}; approached {position:g} {unit} again")
-PICTURES_LOST = event(
-    "pictures_lost", "warning", "{device}: {reason}", "have it mounted; pictures that come meanwhile are read then"
-)
+PICTURES_LOST = event("pictures_lost", "warning", "{device}: {reason}",
+    "have it mounted; pictures that come meanwhile are read then")
 PICTURES_BACK = event("pictures_back", "info", "{device}: its folder is there again")
-NO_PICTURE = event(
-    "no_picture",
-    "warning",
-    "{device}: no picture for {minutes:g} min",
-    "see that the imager takes pictures, and that its folder is the one of the stand's file",
-)
+NO_PICTURE = event("no_picture", "warning", "{device}: no picture for {minutes:g} min",
+    "see that the imager takes pictures, and that its folder is the one of the stand's file")
 PICTURE_TAKEN = event("picture_taken", "info", "{device}: {file} of {model} {serial_number}")
-PICTURE_LEFT_OUT = event(
-    "picture_left_out",
-    "warning",
-    "{device}: {file} is left out: {reason}",
-    "see that the imager is the one of the stand's file, and stores radiometric JPEGs",
-)
-CLOCK_SET_BACK = event(
-    "clock_set_back",
-    "warning",
+PICTURE_LEFT_OUT = event("picture_left_out", "warning", "{device}: {file} is left out: {reason}",
+    "see that the imager is the one of the stand's file, and stores radiometric JPEGs")
+CLOCK_SET_BACK = event("clock_set_back", "warning",
     "{device}: its clock was set back by {by_s} s, and its pictures are dated accordingly from now on",
-    "nothing to do: its pictures are dated by the new offset; set its clock between two nights",
-)
+    "nothing to do: its pictures are dated by the new offset; set its clock between two nights")
 
 # The camera.
-CAMERA_LOST = event(
-    "camera_lost", "warning", "{said}", CAMERA_ENDS, alert=Alert("device_lost", "camera", "lasting"), counts=True
-)
+CAMERA_LOST = event("camera_lost", "warning", "{said}", CAMERA_ENDS, alert=Alert("device_lost", "camera", "lasting"),
+    counts=True)
 CAMERA_BACK = event("camera_back", "info", "{said}", alert=Alert("device_lost", "camera", "over"))
-CAMERA_NOT_OPENED = event(
-    "camera_not_opened", "warning", "the camera is powered, and cannot be opened: {said}", CONNECTED
-)
-CAMERA_SUPPLY_OFF = event(
-    "camera_supply_off",
-    "error",
-    "the camera's supply is off though it was switched on: a brown-out of the relay board, or a person",
-    CONNECTED,
-    counts=True,
-)
-NO_CAMERA_TEMPERATURE = event(
-    "no_camera_temperature",
-    "warning",
+CAMERA_NOT_OPENED = event("camera_not_opened", "warning", "the camera is powered, and cannot be opened: {said}",
+    CONNECTED)
+CAMERA_SUPPLY_OFF = event("camera_supply_off", "error",
+    "the camera's supply is off though it was switched on: a brown-out of the relay board, or a person", CONNECTED,
+    counts=True)
+NO_CAMERA_TEMPERATURE = event("no_camera_temperature", "warning",
     "the camera is configured to have no temperature: no drift over it can be fitted to this session",
-    "name the camera's temperature in the stand's file, if it has one: `stand check`",
-)
-COOLED_DOWN = event(
-    "cooled_down",
-    "info",
-    "after {waited_s:.0f} s the camera should be {excess_K:+.2f} K from the air, within {band_K:g} K",
-)
-COOL_DOWN_UNSURE = event(
-    "cool_down_unsure",
-    "warning",
-    "{said}",
-    "see by the first readings whether the camera was cold when it was switched on; " + _CAREFUL,
-)
-CAMERA_EQUILIBRIUM_LOST = event(
-    "camera_equilibrium_lost",
-    "warning",
-    "the camera's equilibrium is lost, it is soaked again: {reason}",
-    _NEW_END,
-    counts=True,
-)
+    "name the camera's temperature in the stand's file, if it has one: `stand check`")
+COOLED_DOWN = event("cooled_down", "info",
+    "after {waited_s:.0f} s the camera should be {excess_K:+.2f} K from the air, within {band_K:g} K")
+COOL_DOWN_UNSURE = event("cool_down_unsure", "warning", "{said}",
+    "see by the first readings whether the camera was cold when it was switched on; " + _CAREFUL)
+CAMERA_EQUILIBRIUM_LOST = event("camera_equilibrium_lost", "warning",
+    "the camera's equilibrium is lost, it is soaked again: {reason}", _NEW_END, counts=True)
 
 
 def _at_rest(said: str, soaked_s: float, rate_K_per_min: float | None) -> str:
     """the camera is in equilibrium after {soaked_s:min} min: its temperature moves by {rate_K_per_min} K/min"""
-    known = f"moves by at most {rate_K_per_min:.3f} K/min"
-    how = "is not known; five time constants are over" if rate_K_per_min is None else known
+    how = "is not known; five time constants are over"
+    if rate_K_per_min is not None:
+        how = f"moves by at most {rate_K_per_min:.3f} K/min"
     return f"the camera is in equilibrium after {soaked_s / 60:.0f} min: its temperature {how}"
 
 
@@ -450,76 +362,38 @@ def _not_at_rest(said: str, soaked_s: float, rate_K_per_min: float | None) -> st
 
 
 CAMERA_EQUILIBRIUM = event("camera_equilibrium", "info", _at_rest)
-CAMERA_EQUILIBRIUM_LATE = event(
-    "camera_equilibrium_late",
-    "warning",
-    _not_at_rest,
-    "see what still warms or cools the camera: its supply, a draught, a lamp",
-)
+CAMERA_EQUILIBRIUM_LATE = event("camera_equilibrium_late", "warning", _not_at_rest,
+    "see what still warms or cools the camera: its supply, a draught, a lamp")
 _OFFSETS = (
     "camera minus air was {before_K:.2f} K at {before_degC:g} degC before the gap, and is {after_K:.2f} K at "
     "{after_degC:g} degC after it"
 )
 CAMERA_OFFSET_SAME = event("camera_offset_same", "info", _OFFSETS)
-CAMERA_OFFSET_CHANGED = event(
-    "camera_offset_changed",
-    "warning",
-    _OFFSETS,
-    "see whether the camera, its supply or its mount were touched; " + _CAREFUL,
-)
+CAMERA_OFFSET_CHANGED = event("camera_offset_changed", "warning", _OFFSETS,
+    "see whether the camera, its supply or its mount were touched; " + _CAREFUL)
 
 # The recording and its disk.
-TELEMETRY_NOT_SAVED = event(
-    "telemetry_not_saved",
-    "error",
-    "telemetry is kept in memory: {said}",
-    DISK,
-    alert=Alert("disk", "telemetry", "lasting"),
-    counts=True,
-)
-TELEMETRY_SAVED_AGAIN = event(
-    "telemetry_saved_again", "info", "the disk takes telemetry again", alert=Alert("disk", "telemetry", "over")
-)
-DISK_NEARLY_FULL = event(
-    "disk_nearly_full",
-    "warning",
-    "{free_bytes:GB} of {total_bytes:GB} GB are free on the disk",
-    ROOM,
-    alert=Alert("disk", "nearly full"),
-)
-FRAMES_STOPPED = event(
-    "frames_stopped",
-    "error",
-    "frames are not recorded any more: {reason}",
-    ROOM,
-    alert=Alert("disk", "frames", "lasting"),
-    counts=True,
-)
+TELEMETRY_NOT_SAVED = event("telemetry_not_saved", "error", "telemetry is kept in memory: {said}", DISK,
+    alert=Alert("disk", "telemetry", "lasting"), counts=True)
+TELEMETRY_SAVED_AGAIN = event("telemetry_saved_again", "info", "the disk takes telemetry again",
+    alert=Alert("disk", "telemetry", "over"))
+DISK_NEARLY_FULL = event("disk_nearly_full", "warning", "{free_bytes:GB} of {total_bytes:GB} GB are free on the disk",
+    ROOM, alert=Alert("disk", "nearly full"))
+FRAMES_STOPPED = event("frames_stopped", "error", "frames are not recorded any more: {reason}", ROOM,
+    alert=Alert("disk", "frames", "lasting"), counts=True)
 FRAMES_RESUMED = event("frames_resumed", "info", "frames are recorded again", alert=Alert("disk", "frames", "over"))
-FRAMES_DROPPED = event(
-    "frames_dropped", "error", "frames lost: {said}, {total} in all; {reason}", _SHOW_SESSION, counts=True
-)
-READINGS_DROPPED = event(
-    "readings_dropped",
-    "error",
-    "the disk has taken nothing for so long that readings are dropped; events and frames' data are kept",
-    DISK,
-    alert=Alert("disk", "readings"),
-    counts=True,
-)
-READINGS_LOST = event(
-    "readings_lost",
-    "error",
-    "{readings} readings from {from_ns:utc} to {to_ns:utc} were dropped while the disk took nothing",
-    _SHOW_SESSION,
-    alert=Alert("disk", "readings", "over"),
-    counts=True,
-)
+FRAMES_DROPPED = event("frames_dropped", "error", "frames lost: {said}, {total} in all; {reason}", _SHOW_SESSION,
+    counts=True)
+READINGS_DROPPED = event("readings_dropped", "error",
+    "the disk has taken nothing for so long that readings are dropped; events and frames' data are kept", DISK,
+    alert=Alert("disk", "readings"), counts=True)
+READINGS_LOST = event("readings_lost", "error",
+    "{readings} readings from {from_ns:utc} to {to_ns:utc} were dropped while the disk took nothing", _SHOW_SESSION,
+    alert=Alert("disk", "readings", "over"), counts=True)
 FOLDER_LOST = event("folder_lost", "error", "{said}", _CLEAR_FOLDER, counts=True)
 FOLDER_BACK = event("folder_back", "info", "the session's folder {folder} is back")
-FOLDER_NOT_MADE = event(
-    "folder_not_made", "error", "{folder}: no folder can be made there again ({said})", _CLEAR_FOLDER
-)
+FOLDER_NOT_MADE = event("folder_not_made", "error", "{folder}: no folder can be made there again ({said})",
+    _CLEAR_FOLDER)
 
 
 def _recording_lost(said: str, what: list[str], from_ns: int, to_ns: int, reason: str, counts: object) -> str:
@@ -530,9 +404,8 @@ def _recording_lost(said: str, what: list[str], from_ns: int, to_ns: int, reason
 
 RECORDING_LOST = event("recording_lost", "error", _recording_lost, _SHOW_SESSION, counts=True)
 SEARCH_FAILED = event("search_failed", "warning", "{said}", _NOTHING + ": frames are larger, and none is lost")
-SEGMENT_GIVEN_UP = event(
-    "segment_given_up", "warning", "{said}", "`stand session verify {folder}` reads all of it, once the run has ended"
-)
+SEGMENT_GIVEN_UP = event("segment_given_up", "warning", "{said}",
+    "`stand session verify {folder}` reads all of it, once the run has ended")
 SALVAGED = event("salvaged", "warning", "{said}", "`stand session verify` reads what was recovered")
 TRIMMED = event("session.trimmed", "info", "{said}")
 
@@ -548,21 +421,12 @@ def _clock_step(said: str, offset_before_ns: int, offset_after_ns: int, **_: obj
     )
 
 
-CLOCK_STEP = event(
-    "clock_step",
-    lambda data: "info" if data.get("offset_before_ns") == data.get("offset_after_ns") else "warning",
-    _clock_step,
-    "see that one program sets the clock: `timedatectl timesync-status`, or `chronyc tracking`",
-    counts=True,
-    cases=({"offset_before_ns": 0, "offset_after_ns": 1}, {}),
-)
-HOST_SUSPENDED = event(
-    "host_suspended",
-    "warning",
-    "the host was suspended for {said}: nothing was watched or recorded meanwhile",
-    _SLEEP,
-    counts=True,
-)
+CLOCK_STEP = event("clock_step",
+    lambda data: "info" if data.get("offset_before_ns") == data.get("offset_after_ns") else "warning", _clock_step,
+    "see that one program sets the clock: `timedatectl timesync-status`, or `chronyc tracking`", counts=True,
+    cases=({"offset_before_ns": 0, "offset_after_ns": 1}, {}))
+HOST_SUSPENDED = event("host_suspended", "warning",
+    "the host was suspended for {said}: nothing was watched or recorded meanwhile", _SLEEP, counts=True)
 
 
 # A run and its plan.
@@ -577,99 +441,48 @@ def _end_alert(data: Data) -> Alert:
 
 
 RUN_START = event("run.start", "info", "recipe {recipe}", alert=Alert("run_started"), counts=True)
-RUN_RESUME = event(
-    "run.resume",
-    "info",
-    "recipe {recipe} is resumed, {steps_done} steps are done; thermostand {version}",
-    alert=Alert("run_started"),
-    counts=True,
-)
-RUN_END = event(
-    "run.end",
-    lambda data: "info" if data.get("status") == "complete" else "error",
-    "{said}",
-    _end_advice,
-    alert=_end_alert,
-    counts=True,
-    cases=({"status": "complete"}, {"status": "failed"}),
-)
+RUN_RESUME = event("run.resume", "info",
+    "recipe {recipe} is resumed, {steps_done} steps are done; thermostand {version}", alert=Alert("run_started"),
+    counts=True)
+RUN_END = event("run.end", lambda data: "info" if data.get("status") == "complete" else "error", "{said}", _end_advice,
+    alert=_end_alert, counts=True, cases=({"status": "complete"}, {"status": "failed"}))
 RUN_BEGINS = (RUN_START, RUN_RESUME)
 RUN_FAILED = event("run_failed", "error", "{said}", _QUEUE, alert=Alert("run_aborted"), counts=True)
 """Of one that may not have begun."""
 GAP = event("gap", "warning", "until now nothing was recorded and nobody watched the stand, for {said}", _SHOW_SESSION)
 CLEARED = event("cleared", "warning", "cleared before it was resumed: {said}", _NOTHING)
-STAND_DIFFERS = event(
-    "stand_differs",
-    "warning",
-    "{said}",
-    "`stand stop` if that is not meant, and `stand resume` with the right --config",
-)
+STAND_DIFFERS = event("stand_differs", "warning", "{said}",
+    "`stand stop` if that is not meant, and `stand resume` with the right --config")
 JOURNAL_DAMAGED = event("journal_damaged", "warning", "{said}", "`stand status --plan` shows what counts as done")
 JOURNAL_NOT_SAVED = event("journal_not_saved", "error", "{said}", DISK)
-PLAN_CHANGED = event(
-    "plan_changed",
-    lambda data: "info" if data.get("decided") else "warning",
-    "{said}",
-    _PLAN,
-    counts=True,
-    cases=({}, {"decided": "as a recipe says"}),
-)
+PLAN_CHANGED = event("plan_changed", lambda data: "info" if data.get("decided") else "warning", "{said}", _PLAN,
+    counts=True, cases=({}, {"decided": "as a recipe says"}))
 TELL_PLAN = (*RUN_BEGINS, PLAN_CHANGED)
 """Whose data have the number of `steps` and `frames` of the plan."""
 UNDECIDED = event("undecided", "warning", "{said}", _PLAN)
-STEP_BROKEN_OFF = event(
-    "step_broken_off",
-    "warning",
-    "{step} was broken off by an interlock ({said})",
-    "nothing is to be done; it is done again when the hold is over",
-    counts=True,
-)
-CAPTURE_RESTARTED = event(
-    "capture_restarted",
-    "warning",
-    "capture {step_id} is restarted, {said}; its {frames} frames so far do not count",
-    _NEW_END,
-    counts=True,
-)
-WARM_UP_GAP = event(
-    "warm_up_gap",
-    "warning",
-    "the run was held: the camera has warmed up for {missing_s:.1f} s without a frame",
-    _CAREFUL,
-    counts=True,
-)
+STEP_BROKEN_OFF = event("step_broken_off", "warning", "{step} was broken off by an interlock ({said})",
+    "nothing is to be done; it is done again when the hold is over", counts=True)
+CAPTURE_RESTARTED = event("capture_restarted", "warning",
+    "capture {step_id} is restarted, {said}; its {frames} frames so far do not count", _NEW_END, counts=True)
+WARM_UP_GAP = event("warm_up_gap", "warning",
+    "the run was held: the camera has warmed up for {missing_s:.1f} s without a frame", _CAREFUL, counts=True)
 RESTORED = event("restored", "info", "{said}")
 SOAK_RESTARTED = event("soak_restarted", "warning", "{said}; the soak is restarted", _NEW_END, counts=True)
 SOAK_CREDITED = event("soak_credited", "info", "{said}")
 SOAK_LONGER = event("soak_longer", "info", "{said}; the soak goes on, for {by_s:.0f} s at least")
-SOAK_UNSETTLED = event(
-    "soak_unsettled",
-    "warning",
-    "{said}; the frames after it are marked as unsettled",
-    "a fit leaves its frames out; give the recipe's soak more time, or see what keeps the chamber",
-)
+SOAK_UNSETTLED = event("soak_unsettled", "warning", "{said}; the frames after it are marked as unsettled",
+    "a fit leaves its frames out; give the recipe's soak more time, or see what keeps the chamber")
 SETTLED = event("settled", "info", "settled after {soaked_s:min} min: {said}")
-NOT_SETTLED = event(
-    "not_settled",
-    "warning",
-    "not settled after {soaked_s:min} min: {said}",
-    "the plan goes on; `max_s` of the recipe's soak gives it longer",
-)
-PROMPT = event(
-    "prompt",
-    lambda data: "warning" if data.get("attended") else "info",
-    "{what}",
+NOT_SETTLED = event("not_settled", "warning", "not settled after {soaked_s:min} min: {said}",
+    "the plan goes on; `max_s` of the recipe's soak gives it longer")
+PROMPT = event("prompt", lambda data: "warning" if data.get("attended") else "info", "{what}",
     "`stand continue` when it is done",
-    alert=lambda data: Alert("prompt", str(data.get("what"))) if data.get("attended") else None,
-    counts=True,
-    cases=({"attended": True}, {}),
-)
-PROMPT_SKIPPED = event(
-    "prompt_skipped", "warning", "no operator; not done: {what}", "`stand run --attended` waits for it", counts=True
-)
-ETA_SLIPPED = event(
-    "eta_slipped", "info", "the run ends {later_s:min} min later than expected, at {said}", alert=Alert("eta_slipped")
-)
+    alert=lambda data: Alert("prompt", str(data.get("what"))) if data.get("attended") else None, counts=True,
+    cases=({"attended": True}, {}))
+PROMPT_SKIPPED = event("prompt_skipped", "warning", "no operator; not done: {what}",
+    "`stand run --attended` waits for it", counts=True)
+ETA_SLIPPED = event("eta_slipped", "info", "the run ends {later_s:min} min later than expected, at {said}",
+    alert=Alert("eta_slipped"))
 
 
 # The program: what clients order, the queue, the daemon.
@@ -681,53 +494,33 @@ def _command(said: str, who: str, how: str, result: str, **_: object) -> str:
 COMMAND = event("command", "info", _command, counts=True, is_shown=True)
 NOTE = event("note", "info", "{said}")
 OPEN = event("open", "info", "{stand} is open; sessions go to {sessions}{said}")
-QUEUE = event("queue", "info", "{said}", _QUEUE, is_shown=True)
+QUEUE = event("queue", "info", "{said}", is_shown=True)
 QUEUE_NOT_CLEARED = event("queue_not_cleared", "warning", "{said}", _QUEUE)
 QUEUE_EMPTY = event("queue_empty", "info", "all that was queued is done", alert=Alert("queue_empty"))
-NOT_RESUMED = event(
-    "not_resumed", "error", "run {run} is not resumed by itself: {said}", "`stand clear`, then `stand resume`"
-)
-RECORDING_RESTARTED = event(
-    "recording_restarted",
-    "warning",
-    "{session}: its writer was killed; the run is resumed",
-    "see what killed it: `journalctl -k` tells of a lack of memory",
-)
-HOUSE_NOT_RECORDED = event(
-    "house_not_recorded", "error", "nothing is recorded between runs, so nothing is heated: {said}", _SEE_DISK
-)
+NOT_RESUMED = event("not_resumed", "error", "run {run} is not resumed by itself: {said}",
+    "`stand clear`, then `stand resume`")
+RECORDING_RESTARTED = event("recording_restarted", "warning", "{session}: its writer was killed; the run is resumed",
+    "see what killed it: `journalctl -k` tells of a lack of memory")
+HOUSE_NOT_RECORDED = event("house_not_recorded", "error",
+    "nothing is recorded between runs, so nothing is heated: {said}", _SEE_DISK)
 HOUSE_NOT_ENDED = event("house_not_ended", "warning", "{said}", _SEE_DISK)
 """The record between runs that was to be completed, or to be followed by today's."""
-IDLE_LOGS_REMOVED = event(
-    "idle_logs_removed", "info", "records between runs older than {days} days were removed: {names}"
-)
+IDLE_LOGS_REMOVED = event("idle_logs_removed", "info",
+    "records between runs older than {days} days were removed: {names}")
 REPORTED = event("reported", "info", "the report of {session} is made; the page has it under Sessions")
-REPORT = event(
-    "report",
-    "warning",
-    "{session}: {said}",
-    "the session's report shows where: *Sessions* on the page, or its report.html",
-)
+REPORT = event("report", "warning", "{session}: {said}",
+    "the session's report shows where: *Sessions* on the page, or its report.html")
 NOT_REPORTED = event("not_reported", "warning", "{said}", "`stand session list` shows what the session lacks")
 DAEMON_NOT_KEPT = event("daemon_not_kept", "warning", "counters are not kept for the next start: {said}", _SEE_DISK)
-DAEMON_FILE_DAMAGED = event(
-    "daemon_file_damaged", "warning", "{said}", "read the counters in the damaged file, if they matter"
-)
-LOOPBACK_TRUSTED = event(
-    "loopback_trusted",
-    "warning",
+DAEMON_FILE_DAMAGED = event("daemon_file_damaged", "warning", "{said}",
+    "read the counters in the damaged file, if they matter")
+LOOPBACK_TRUSTED = event("loopback_trusted", "warning",
     "every program of this machine {said} without a token (trust_loopback)",
-    "take `interface.trust_loopback` out of the stand's file when that is not wanted",
-)
+    "take `interface.trust_loopback` out of the stand's file when that is not wanted")
 TOKENS_READ = event("tokens_read", "info", "tokens were read again: {said}", is_shown=True)
-TOKENS_NOT_READ = event(
-    "tokens_not_read",
-    "warning",
-    "{said}; the tokens stay as they were",
-    "mend the file, and send SIGHUP again; `stand token list` reads it, too",
-)
-INTERFACE_FAILED = event(
-    "interface_failed", "warning", "{said}", "what runs goes on; once it has ended, begin `stand serve` again"
-)
+TOKENS_NOT_READ = event("tokens_not_read", "warning", "{said}; the tokens stay as they were",
+    "mend the file, and send SIGHUP again; `stand token list` reads it, too")
+INTERFACE_FAILED = event("interface_failed", "warning", "{said}",
+    "what runs goes on; once it has ended, begin `stand serve` again")
 NO_CONTROL = event("no_control", "warning", "{said}", "Ctrl-C where it was begun still stops the run")
 PREVIEW = event("preview", "warning", "{said}", "nothing is to be done; frames are recorded all the same")

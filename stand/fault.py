@@ -8,6 +8,8 @@ from typing import Literal, Protocol
 
 from pydantic import JsonValue
 
+from foundation.events import guard_kind
+from foundation.items import Event
 from foundation.readings import Reading
 
 
@@ -53,6 +55,10 @@ class Fault:
         """What a program needs to know of it besides its words."""
         compared: dict[str, JsonValue] = {"channels": list(self.channels), "suspect": self.suspect}
         return {"action": self.action, "ends_itself": self.ends_itself, **(compared if self.channels else {})}
+
+    def at(self, time_ns: int) -> Event:
+        """That the rule objects, as an event."""
+        return guard_kind(self.rule).at(time_ns, self.text, rule=self.rule, **self.data)
 
 
 def value_of(readings: Readings, channel: str) -> float:

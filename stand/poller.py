@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from drivers.devices.protocols import Sensor
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError
+from foundation.events import DEVICE_BACK, DEVICE_FAST, DEVICE_LOST, DEVICE_SLOW
 from foundation.hub import Hub
-from foundation.items import Batch, Event
+from foundation.items import Batch
 from foundation.readings import Cause, Reading, bad_reading
 
 _AGAIN_S = 1.0  # after a poll that failed on the wire
@@ -70,8 +71,7 @@ class Poller:
             self._failing = False
             now_ns, name = self.clock.now_ns(), self.sensor.name
             lost_s = round((now_ns - self._lost_ns) / NS_PER_S, 3)
-            data: dict[str, object] = {"device": name, "lost_s": lost_s}
-            self.hub.publish(Event(now_ns, "info", "device_back", f"{name} answers again after {lost_s:g} s", data))
+            self.hub.publish(DEVICE_BACK.at(now_ns, device=name, lost_s=lost_s))
         self._publish(readings)
 
     def _time(self, took_ns: int) -> None:
@@ -84,12 +84,10 @@ class Poller:
         data: dict[str, object] = {"device": name, "took_s": took_s, "period_s": self.period_s}
         if not self._is_slow:
             self._is_slow = True
-            text = f"{name} took {took_s:g} s to answer and is read every {self.period_s:g} s: readings are missing"
-            self.hub.publish(Event(now_ns, "warning", "device_slow", text, data))
+            self.hub.publish(DEVICE_SLOW.at(now_ns, **data))
         elif now_ns - self._slow_ns >= _FAST_AFTER_NS:
             self._is_slow = False
-            text = f"{name} answers within {took_s:g} s again"
-            self.hub.publish(Event(now_ns, "info", "device_fast", text, data))
+            self.hub.publish(DEVICE_FAST.at(now_ns, **data))
 
     def _publish(self, readings: tuple[Reading, ...]) -> None:
         if not readings:
@@ -103,7 +101,7 @@ class Poller:
         cause: Cause = "wire" if error.retryable else "device"
         if not self._failing:
             self._failing, self._lost_ns = True, now_ns
-            data: dict[str, object] = {"device": self.sensor.name, "error": type(error).__name__, "cause": cause}
-            self.hub.publish(Event(now_ns, "warning", "device_lost", reason, data))
+            data = {"device": self.sensor.name, "error": type(error).__name__, "cause": cause}
+            self.hub.publish(DEVICE_LOST.at(now_ns, reason, **data))
         bad = tuple(bad_reading(reading.channel, reading.unit, now_ns, reason, cause) for reading in self._known)
         self.hub.publish(Batch(self.sensor.name, now_ns, bad))

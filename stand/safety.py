@@ -13,8 +13,8 @@ from typing import Protocol
 
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import GarbledReply, Unreachable
+from foundation.events import CONFIRMED_SAFE, NOT_CONFIRMED_SAFE
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.tasks import first_of
 
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
@@ -216,8 +216,8 @@ class Safety:
         while not self.is_confirmed and not self._given_up and self._clock.now_ns() < end_ns:
             due_ns = min(end_ns, self._clock.now_ns() + seconds_ns(_REPORTED_EVERY_S))
             if not await self._changes_before(due_ns) and not self.is_confirmed:
-                text = f"still trying: {'; '.join(self.unconfirmed)}"
-                self._hub.publish(Event(self._clock.now_ns(), "error", "not_confirmed_safe", text, self._data()))
+                text, unconfirmed = f"still trying: {'; '.join(self.unconfirmed)}", list(self.unconfirmed)
+                self._hub.publish(NOT_CONFIRMED_SAFE.at(self._clock.now_ns(), text, unconfirmed=unconfirmed))
         return self.is_confirmed
 
     async def close(self) -> None:
@@ -248,12 +248,8 @@ class Safety:
         for maker in self._makers:
             if maker.failure and self._reported.get(maker) != maker.failure:
                 self._reported[maker] = maker.failure
-                data: dict[str, object] = {"unconfirmed": [maker.failure]}
-                event = Event(self._clock.now_ns(), "error", "not_confirmed_safe", maker.failure, data)
-                self._hub.publish(event)
+                unsafe = NOT_CONFIRMED_SAFE.at(self._clock.now_ns(), maker.failure, unconfirmed=[maker.failure])
+                self._hub.publish(unsafe)
         if self._reported and self.is_confirmed:
             self._reported.clear()
-            self._hub.publish(Event(self._clock.now_ns(), "info", "confirmed_safe", "the stand is safe"))
-
-    def _data(self) -> dict[str, object]:
-        return {"unconfirmed": list(self.unconfirmed)}
+            self._hub.publish(CONFIRMED_SAFE.at(self._clock.now_ns()))

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from compensation.budget.session_temperatures import CaptureState, capture_states
 from compensation.one_camera import others_ns
+from foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE
 from foundation.items import Event
 from markers.detection import Detection, DetectionError, detect
 from markers.target import Target
 from recording.reading.session import Session
-
-_HOME_KINDS = ("home_residual", "home_residual_large")
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +29,11 @@ class Repeatability:
 
 def home_residuals(events: Sequence[Event], unit: str) -> Repeatability:
     """Where the axes that move in `unit` (mm or deg) found their homes, against where they expected them."""
-    recorded = [event.data for event in events if event.kind in _HOME_KINDS and event.data.get("unit") == unit]
+    recorded = [
+        event.data
+        for event in events
+        if event.kind in (HOME_RESIDUAL, HOME_RESIDUAL_LARGE) and event.data.get("unit") == unit
+    ]
     found = [float(residual) for data in recorded if isinstance(residual := data.get("residual"), int | float)]
     return Repeatability(_rms(np.array(found)), unit, len(found))
 

@@ -8,6 +8,7 @@ from typing import Any
 from compensation.datasheet.details import Details
 from foundation.documents import yaml_data
 from foundation.errors import ConfigError
+from foundation.events import DEVICE_IDENTITY
 from markers.target import Target
 from recording.reading.session import Session
 
@@ -32,7 +33,7 @@ def _identities(session: Session) -> Iterator[Line]:
     """What each device said of itself, or its register map of it, the last time; the camera of these frames first."""
     found: dict[str, dict[str, Any]] = {}
     for event in session.events():
-        if event.kind == "device_identity":
+        if event.kind == DEVICE_IDENTITY:
             found[str(event.data["device"])] = dict(event.data)
     own = found.pop(session.camera, None)
     if own is not None:

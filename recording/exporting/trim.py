@@ -16,8 +16,9 @@ from mcap.writer import CompressionType
 
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import SessionError
+from foundation.events import TRIMMED
 from foundation.files import new_folder
-from foundation.items import Event, StepMark, StepState
+from foundation.items import StepMark, StepState
 from recording.exporting.topics import recorded_topics
 from recording.format import messages
 from recording.format.holes import holes_text
@@ -31,7 +32,6 @@ from recording.writing.recorder import RecordingSettings
 from recording.writing.segment import Record, SeriesForm, Topic
 from recording.writing.series import Series
 
-TRIMMED = "session.trimmed"  # kind of the event that says where a session was cut from
 # Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
 BLOCK_NS = 60 * NS_PER_S
 BLOCK_BYTES = 1 << 20
@@ -105,7 +105,7 @@ def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Ite
     mark = _step_under_way(session, begin_ns)
     if mark is not None:
         text += f"; the mark of step {mark.step_id}, started {utc.utc_text(mark.time_ns)}, is repeated at the start"
-    event = Event(first_ns, "info", TRIMMED, text)
+    event = TRIMMED.at(first_ns, text)
     yield Record(messages.EVENT, first_ns, messages.encode_event(event))
     yield Record(messages.LOG, first_ns, messages.encode_log(event))
     if mark is not None:

@@ -9,25 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from foundation.events import CAPTURE_RESTARTED
 from foundation.items import Event
-
-KIND = "capture_restarted"
-_TEXT = "capture {} is restarted, {}; its {} frames so far do not count"
 
 
 def restarted(time_ns: int, step_id: str, frames: int, how: str, frames_lost: int = 0) -> Event:
     """The event: so many frames of that step, all before `time_ns`, are superseded. how: as in `from a cold camera`."""
-    data: dict[str, object] = {
-        "step_id": step_id,
-        "frames": frames,
-        **({"frames_lost": frames_lost} if frames_lost else {}),
-    }
-    return Event(time_ns, "warning", KIND, _TEXT.format(step_id, how, frames), data)
+    lost = {"frames_lost": frames_lost} if frames_lost else {}
+    return CAPTURE_RESTARTED.at(time_ns, how, step_id=step_id, frames=frames, **lost)
 
 
 def restarted_step(event: Event) -> str:
     """The id of the capture that was restarted; "" when the event is of another kind."""
-    named = event.data.get("step_id") if event.kind == KIND else None
+    named = event.data.get("step_id") if event.kind == CAPTURE_RESTARTED else None
     return named if isinstance(named, str) else ""
 
 

@@ -20,10 +20,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from foundation.clock import NS_PER_S
+from foundation.events import CLOCK_STEP
 from foundation.instants import date_time, local_text, utc_text
 from foundation.items import Event
 
-CLOCK_STEP = "clock_step"
 REPEATED_NS = 300 * NS_PER_S  # as long as the offset is not 0
 _INT64 = (-(1 << 63), (1 << 63) - 1)
 
@@ -77,15 +77,19 @@ def offsets_of(events: Iterable[Event]) -> UtcOffsets:
 
 def offset_event(time_ns: int, offset_ns: int) -> Event:
     """That the offset is this one still, for a segment or a part that begins with it."""
-    data = {
-        "offset_before_ns": offset_ns,
-        "offset_after_ns": offset_ns,
-        "seen_ns": time_ns,
-        "stand_ns": time_ns,
-        "utc_ns": time_ns + offset_ns,
-    }
-    text = f"UTC is still {offset_ns / NS_PER_S:+.3f} s from recorded instants"
-    return Event(time_ns, "info", CLOCK_STEP, text, data)
+    return step_event(time_ns, offset_ns, offset_ns, time_ns)
+
+
+def step_event(time_ns: int, before_ns: int, after_ns: int, seen_ns: int) -> Event:
+    """That the offset is `after_ns` now, and was before_ns until seen_ns."""
+    return CLOCK_STEP.at(
+        time_ns,
+        offset_before_ns=before_ns,
+        offset_after_ns=after_ns,
+        seen_ns=seen_ns,
+        stand_ns=time_ns,
+        utc_ns=time_ns + after_ns,
+    )
 
 
 def _step(event: Event) -> tuple[int, int, int] | None:

@@ -13,10 +13,6 @@ from recording.format import messages
 from recording.format.messages import FrameMeta
 from recording.format.records import Message
 
-RUN_END = "run.end"  # kind of the event that records how a run ended
-RUN_BEGINS = ("run.start", "run.resume")  # and of those that it began, or was resumed
-PLAN_CHANGED = "plan_changed"  # and of that an operator has changed what is still to be done
-TELL_PLAN = (*RUN_BEGINS, PLAN_CHANGED)  # whose data have the number of `steps` and `frames` of the plan
 FrameKey = tuple[int, int]  # time_ns and sequence, which an image and its description share
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from math import inf
 
 from foundation.clock import NS_PER_S
+from foundation.events import RUN_BEGINS, RUN_END
 from foundation.items import Event
 from recording.format.chain import Link
 from recording.format.holes import Hole
 from recording.format.inventory import SegmentFile, State
 from recording.format.layout import TELEMETRY
-from recording.reading.contents import RUN_BEGINS, RUN_END
 from recording.reading.journal_lines import JournalFacts
 
 # Between the middle of a frame's exposure and its description being on the disk, or the frame itself.

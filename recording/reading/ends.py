@@ -12,12 +12,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from foundation.clock import NS_PER_S
+from foundation.events import RUN_BEGINS, RUN_END, TELL_PLAN
 from foundation.items import Event, StepMark, StepState
 from recording.format.holes import Hole
 from recording.format.inventory import State
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.format.utc_offsets import UtcOffsets
-from recording.reading.contents import RUN_BEGINS, RUN_END, TELL_PLAN
 from recording.reading.coverage import Coverage
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts
 from recording.reading.run_word import last_run_event

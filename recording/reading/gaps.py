@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foundation.clock import NS_PER_S
+from foundation.events import FRAMES_DROPPED
 from foundation.instants import duration
 from foundation.items import Event
 from recording.format.utc_offsets import UtcOffsets
 
-FRAMES_DROPPED = "frames_dropped"  # kind of the recorder's events
 SHORTEST_NS = 5 * NS_PER_S
 MEDIANS = 3
 _LAST_BLOCK = 2**62

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from foundation.errors import SessionError
+from foundation.events import RUN_END, TELL_PLAN
 from foundation.items import Event, StepMark, StepState
 from recording.format.images import decode_image
 from recording.format.inventory import SegmentFile, State
 from recording.format.layout import FRAMES
 from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
 from recording.format.utc_offsets import UtcOffsets, offsets_of
-from recording.reading.contents import RUN_END, TELL_PLAN, Channel, Contents
+from recording.reading.contents import Channel, Contents
 from recording.reading.gaps import Silence, reported_blocks, silences
 from recording.reading.glance import Glance, glance, within
 from recording.reading.run_word import Files

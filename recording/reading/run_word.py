@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from enum import StrEnum
 
+from foundation.events import RUN_BEGINS, RUN_END
 from foundation.items import Event
-from recording.reading.contents import RUN_BEGINS, RUN_END
 from recording.reading.journal_lines import JournalFacts
 
 

@@ -14,6 +14,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from foundation.errors import SessionError
+from foundation.events import FRAMES_DROPPED
 from recording.format.chain import MOST_MISSING, Link, foreign_numbers, misplaced, missing_segments
 from recording.format.holes import Hole, holes_in, segments_text
 from recording.format.images import CAMERA_IMAGE
@@ -34,7 +35,7 @@ from recording.reading.coverage import Coverage, coverage_of
 from recording.reading.ends import is_of_a_run, lost_end
 from recording.reading.extent import Extent, extent_of
 from recording.reading.frame_account import frame_account
-from recording.reading.gaps import FRAMES_DROPPED, reported_blocks, silences
+from recording.reading.gaps import reported_blocks, silences
 from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
 from recording.reading.kept_originals import is_recovered
 from recording.reading.notes import NOTES_NAME, Notes, read_notes

@@ -7,10 +7,10 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from foundation.instants import utc_text
+from foundation.events import FOLDER_BACK, FOLDER_LOST, FOLDER_NOT_MADE, RECORDING_LOST
+from foundation.items import Event
 from recording.format.layout import FRAMES, TELEMETRY
 from recording.writing.home import FolderLost
-from recording.writing.notices import Notice
 
 Refound = Callable[[], Awaitable[bool]]
 
@@ -43,7 +43,7 @@ class Beside(Protocol):
 class Homes:
     """The losses that stand; used from the event loop. `there` is set while the frames' folder is."""
 
-    def __init__(self, directory: Path, tell: Callable[[Notice], None]) -> None:
+    def __init__(self, directory: Path, tell: Callable[[Event], None]) -> None:
         self._directory = directory
         self._tell = tell
         self._lost: dict[str, str] = {}
@@ -86,9 +86,9 @@ class Homes:
         now = self._first()
         if now and not was:
             self._reason = now
-            self._tell(Notice("error", "folder_lost", now, {"folder": str(self._directory)}))
+            self._tell(FOLDER_LOST.at(0, now, folder=str(self._directory)))
         if was and not now and not self._made_again:
-            self._tell(Notice("info", "folder_back", f"the session's folder {self._directory} is back"))
+            self._tell(FOLDER_BACK.at(0, folder=str(self._directory)))
 
     def refind(self) -> None:
         """Ask for `refound`, when there is something to find again."""
@@ -105,18 +105,17 @@ class Homes:
                     self._made_again.append(name)
                 self._lost.pop(name, None)
         except OSError as error:
-            text = f"{self._directory}: no folder can be made there again ({error})"
-            self._tell(Notice("error", "folder_not_made", text))
+            self._tell(FOLDER_NOT_MADE.at(0, str(error), folder=str(self._directory)))
             return ()
         finally:
             self.refinding.clear()
         self.there.set()
         made_again, self._made_again = tuple(self._made_again), []
         if not made_again:
-            self._tell(Notice("info", "folder_back", f"the session's folder {self._directory} is back"))
+            self._tell(FOLDER_BACK.at(0, folder=str(self._directory)))
         return made_again
 
-    def loss(self, made_again: tuple[str, ...], from_ns: int) -> Notice:
+    def loss(self, made_again: tuple[str, ...], from_ns: int) -> Event:
         """What is not in the session's folder any more: all that this run had recorded in what was made again."""
         gone = {name: self._kept[name] for name in made_again if name in self._kept}
         self._kept.clear()
@@ -124,8 +123,4 @@ class Homes:
         counts = {name: kept.items for name, kept in gone.items()}
         data = {"what": list(made_again), "from_ns": from_ns, "to_ns": to_ns, "counts": counts, "reason": self._reason}
         lost = "".join(f", {counts[name]} {_UNITS[name]}" for name in counts)
-        text = (
-            f"{self._reason}; {' and '.join(made_again)} continue in a new place without what was recorded from "
-            f"{utc_text(from_ns)} to {utc_text(to_ns)}{lost}"
-        )
-        return Notice("error", "recording_lost", text, data)
+        return RECORDING_LOST.at(0, lost, **data)

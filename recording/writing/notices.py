@@ -1,17 +1,25 @@
-"""What a recording reports of itself: frames and readings that are lost, and a disk that is nearly full."""
+"""What a recording reports of itself: frames and readings that are lost, and a disk that is nearly full.
+
+Events of instant 0: who publishes them says when."""
 
 from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
 
-from foundation.instants import utc_text
-from foundation.items import Batch
+from foundation.events import (
+    DISK_NEARLY_FULL,
+    FRAMES_DROPPED,
+    FRAMES_RESUMED,
+    FRAMES_STOPPED,
+    READINGS_DROPPED,
+    READINGS_LOST,
+)
+from foundation.items import Batch, Event
 from foundation.readings import Frame
 
 
@@ -28,29 +36,12 @@ def disk_space(folder: Path) -> Space:
     return Space(found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize)
 
 
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """An event that has no time yet; see foundation.hub.Event."""
-
-    level: str
-    kind: str
-    text: str
-    data: Mapping[str, object] = field(default_factory=dict[str, object])
-
-
-def telemetry_notice(failure: OSError | None) -> Notice:
-    """Whether the disk takes telemetry, and why not."""
-    if failure is None:
-        return Notice("info", "telemetry_saved_again", "the disk takes telemetry again")
-    return Notice("error", "telemetry_not_saved", f"telemetry is kept in memory: {failure}")
-
-
 class SpaceWatch:
     """Decides whether frames may be written, and reports each change once; `check` is called from several threads.
 
     Below `stop_below_bytes` no frames are written, so that telemetry can continue; below `alert_fraction` of the disk
     there is a warning. `reserved_bytes()` is what the frames have reserved and not yet used: it counts as free.
-    `tell` takes each notice.
+    `tell` takes each event.
     """
 
     def __init__(
@@ -59,7 +50,7 @@ class SpaceWatch:
         stop_below_bytes: int,
         alert_fraction: float,
         reserved_bytes: Callable[[], int],
-        tell: Callable[[Notice], None],
+        tell: Callable[[Event], None],
     ) -> None:
         self._folder = folder
         self._stop_below_bytes = stop_below_bytes
@@ -86,15 +77,13 @@ class SpaceWatch:
     def _judge(self, free_bytes: int, total_bytes: int) -> None:
         nearly_full = free_bytes < self._alert_fraction * total_bytes
         if nearly_full and not self._alerted:
-            text = f"{free_bytes / 1e9:.1f} of {total_bytes / 1e9:.1f} GB are free on the disk"
-            self._tell(Notice("warning", "disk_nearly_full", text))
+            self._tell(DISK_NEARLY_FULL.at(0, free_bytes=free_bytes, total_bytes=total_bytes))
         self._alerted = nearly_full
         stopped = free_bytes < self._stop_below_bytes
         if stopped and not self.frames_stopped:
-            text = f"frames are not recorded any more: {self.stop_reason}"
-            self._tell(Notice("error", "frames_stopped", text))
+            self._tell(FRAMES_STOPPED.at(0, reason=self.stop_reason))
         if self.frames_stopped and not stopped:
-            self._tell(Notice("info", "frames_resumed", "frames are recorded again"))
+            self._tell(FRAMES_RESUMED.at(0))
         self.frames_stopped = stopped
 
 
@@ -126,7 +115,7 @@ class Losses:
         """The capture was restarted: frames it lost before that instant are not missing."""
         self._begins_ns[step_id] = time_ns
 
-    def take(self) -> list[Notice]:
+    def take(self) -> list[Event]:
         """An event for each reason since the last time, which names every block: `blocks` in its data are pairs of the
         first and the last."""
         reasons: dict[str, dict[str, list[int]]] = {}
@@ -136,11 +125,10 @@ class Losses:
             self._reported += 1
         return [self._notice(reason, steps) for reason, steps in reasons.items()]
 
-    def _notice(self, reason: str, steps: dict[str, list[int]]) -> Notice:
+    def _notice(self, reason: str, steps: dict[str, list[int]]) -> Event:
         blocks = [run for blocks in steps.values() for run in runs(blocks)]
         data = {"blocks": blocks, "steps": list(steps), "total": self._reported, "reason": reason}
-        text = f"frames lost: {_by_step(steps)}, {self._reported} in all; {reason}"
-        return Notice("error", "frames_dropped", text, data)
+        return FRAMES_DROPPED.at(0, _by_step(steps), **data)
 
 
 class DroppedReadings:
@@ -151,22 +139,18 @@ class DroppedReadings:
         self._readings = 0
         self._from_ns = self._to_ns = 0
 
-    def count(self, batch: Batch, tell: Callable[[Notice], None]) -> None:
+    def count(self, batch: Batch, tell: Callable[[Event], None]) -> None:
         """One batch that will not be in the session."""
         if not self._readings:
             self._from_ns = batch.time_ns
-            text = "the disk has taken nothing for so long that readings are dropped; events and frames' data are kept"
-            tell(Notice("error", "readings_dropped", text))
+            tell(READINGS_DROPPED.at(0))
         self._readings += len(batch.readings)
         self._to_ns = batch.time_ns
 
-    def end(self, tell: Callable[[Notice], None]) -> None:
+    def end(self, tell: Callable[[Event], None]) -> None:
         """Everything that was kept is on the disk."""
         if self._readings:
-            data = {"readings": self._readings, "from_ns": self._from_ns, "to_ns": self._to_ns}
-            span = f"from {utc_text(self._from_ns)} to {utc_text(self._to_ns)}"
-            text = f"{self._readings} readings {span} were dropped while the disk took nothing"
-            tell(Notice("error", "readings_lost", text, data))
+            tell(READINGS_LOST.at(0, readings=self._readings, from_ns=self._from_ns, to_ns=self._to_ns))
             self._readings = 0
 
 

@@ -15,12 +15,13 @@ import math
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from foundation.calls import Lane
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import SessionError
+from foundation.events import SEGMENT_GIVEN_UP, EventKind
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.patience import Patience
@@ -30,7 +31,6 @@ from recording.writing.disk import Disk
 from recording.writing.forms import SessionForm
 from recording.writing.frames import Frames
 from recording.writing.homes import Beside, Homes
-from recording.writing.notices import Notice
 from recording.writing.recorder_settings import USUAL, RecordingSettings, SessionInfo
 from recording.writing.series import DiskSeries, open_series
 from recording.writing.telemetry import Telemetry
@@ -76,7 +76,7 @@ class Recorder:
         self._clock = clock
         self._settings = settings
         self._waiting = Waiting()
-        self._notices: deque[Notice] = deque()  # from any thread
+        self._notices: deque[Event] = deque()  # from any thread
         tell = self._notices.append
         self._homes = Homes(directory, tell)
         self._frames = Frames(settings, encode, clock, self._waiting, self._homes)
@@ -224,9 +224,9 @@ class Recorder:
                 "completes it when the disk answers"
             ) from error
 
-    def warn(self, kind: str, text: str) -> None:
+    def tell(self, kind: EventKind, said: str) -> None:
         """An event of this kind with the next report; from any thread."""
-        self._notices.append(Notice("warning", kind, text))
+        self._notices.append(kind.at(0, said))
 
     def keep_description(self, description: Description) -> None:
         """A frame's description without its image, as the copy of a session that lost that image has it."""
@@ -264,8 +264,7 @@ class Recorder:
         """Publish what was lost, overcome or noticed since the last time."""
         for series in (self._frames.series, self._telemetry.series):
             while series.troubles:
-                self._notices.append(Notice("warning", "segment_given_up", series.troubles.popleft()))
+                self._notices.append(SEGMENT_GIVEN_UP.at(0, series.troubles.popleft()))
         self._notices.extend(self._frames.losses.take())
         while self._notices:
-            notice = self._notices.popleft()
-            self._hub.publish(Event(self._clock.now_ns(), notice.level, notice.kind, notice.text, notice.data))
+            self._hub.publish(replace(self._notices.popleft(), time_ns=self._clock.now_ns()))

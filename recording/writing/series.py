@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from foundation.files import make_durable_folder, sync_folder
+from foundation.items import Event
 from recording.format.chain import foreign_numbers
 from recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
 from recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
 from recording.writing.forms import SessionForm
 from recording.writing.home import Home
-from recording.writing.notices import Notice, SpaceWatch
+from recording.writing.notices import SpaceWatch
 from recording.writing.segment import CommitSink, Record, Segment, SeriesForm
 
 Item = TypeVar("Item")
@@ -183,7 +184,7 @@ class SpaceFound(NamedTuple):
     frames_stopped: bool = False
     stop_reason: str = ""
     free_bytes: int = 0
-    notices: tuple[Notice, ...] = ()
+    notices: tuple[Event, ...] = ()
 
 
 class SessionSeries:
@@ -197,7 +198,7 @@ class SessionSeries:
         sync_folder(directory.parent)
         frames, telemetry = Series(directory / FRAMES, form.frames()), Series(directory / TELEMETRY, form.telemetry())
         self._series = {FRAMES: frames, TELEMETRY: telemetry}
-        self._notices: deque[Notice] = deque()
+        self._notices: deque[Event] = deque()
         stop, alert = form.settings.stop_frames_below_bytes, form.settings.alert_below_fraction
         self._space = SpaceWatch(directory, stop, alert, lambda: frames.reserved_bytes, self._notices.append)
         telemetry.open(time_ns)
@@ -230,7 +231,7 @@ def _taken(waiting: deque[Item]) -> tuple[Item, ...]:
 class DiskSpace:
     """What the last look at the disk found, whichever series asked; `tell` takes its notices."""
 
-    def __init__(self, tell: Callable[[Notice], None]) -> None:
+    def __init__(self, tell: Callable[[Event], None]) -> None:
         self.last = SpaceFound()
         self._tell = tell
 
@@ -301,7 +302,7 @@ class DiskSeries:
 
 
 def open_series(
-    disk: Disk | None, directory: Path, form: SessionForm, time_ns: int, tell: Callable[[Notice], None]
+    disk: Disk | None, directory: Path, form: SessionForm, time_ns: int, tell: Callable[[Event], None]
 ) -> tuple[DiskSeries, DiskSeries]:
     """Frames and telemetry of a session, made or continued; raises OSError. disk: the process that has them, None: this
     one."""

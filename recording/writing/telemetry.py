@@ -17,6 +17,7 @@ from google.protobuf.message import Message
 from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import SessionError
+from foundation.events import TELEMETRY_NOT_SAVED, TELEMETRY_SAVED_AGAIN
 from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality, Reading
 from recording.format import messages
@@ -24,7 +25,7 @@ from recording.format.decoded_items import Description, UndescribedFrame
 from recording.format.kinds import KINDS, Kind
 from recording.format.layout import SEQUENCE_MASK, TELEMETRY
 from recording.writing.homes import Homes, Kept
-from recording.writing.notices import DroppedReadings, Notice, telemetry_notice
+from recording.writing.notices import DroppedReadings
 from recording.writing.recorder_settings import RecordingSettings
 from recording.writing.segment import Record
 from recording.writing.series import DiskSeries
@@ -47,7 +48,7 @@ class Telemetry:
         clock: Clock,
         waiting: Waiting,
         homes: Homes,
-        tell: Callable[[Notice], None],
+        tell: Callable[[Event], None],
     ) -> None:
         self._directory = directory
         self._encoder = TelemetryEncoder(devices)
@@ -119,7 +120,7 @@ class Telemetry:
         self._waiting.changed()
         if (failure is not None) != self._is_failing:
             self._is_failing = failure is not None
-            self._tell(telemetry_notice(failure))
+            self._tell(TELEMETRY_SAVED_AGAIN.at(0) if failure is None else TELEMETRY_NOT_SAVED.at(0, str(failure)))
         return failure
 
     async def finish(self) -> None:

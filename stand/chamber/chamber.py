@@ -13,8 +13,8 @@ from drivers.devices.protocols import Controller, Switches
 from drivers.devices.regulators.software_regulator import SoftwareRegulator
 from foundation.clock import Clock, boot_of, seconds_ns
 from foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied
+from foundation.events import NO_DEAD_MAN, REGULATOR_OCCUPIED
 from foundation.hub import Hub
-from foundation.items import Event
 from stand.chamber.compressor import restored
 from stand.chamber.compressor_file import CompressorFile
 from stand.chamber.keeper import Keeper
@@ -144,8 +144,7 @@ class Chamber:
                 return await self._regulator.set_temperature(setpoint_degC)
             except Occupied as error:
                 if not is_waiting:
-                    text = f"{error}; the run waits"
-                    self._hub.publish(Event(self._clock.now_ns(), "warning", "regulator_occupied", text))
+                    self._hub.publish(REGULATOR_OCCUPIED.at(self._clock.now_ns(), str(error)))
                 is_waiting = True
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_OCCUPIED_AGAIN_S))
 
@@ -175,6 +174,4 @@ class Chamber:
     def _tell_dead_man(self) -> None:
         """No board drops the heat when this daemon dies: what ends it then is recorded with the session."""
         what = self._regulator.dead_man if isinstance(self._regulator, ClimateChamber) else "nothing"
-        text = f"no relay board guards the heat; when this computer dies, what ends it is {what}"
-        data: dict[str, object] = {"device": self._regulator.name, "ends_it": what}
-        self._hub.publish(Event(self._clock.now_ns(), "warning", "no_dead_man", text, data))
+        self._hub.publish(NO_DEAD_MAN.at(self._clock.now_ns(), device=self._regulator.name, ends_it=what))

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from foundation.calls import Lane
 from foundation.clock import Clock, boot_of
+from foundation.events import COMPRESSOR_NOT_KEPT
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.patience import Patience
 from stand.chamber.compressor import CompressorState, keep
 
@@ -57,8 +57,7 @@ class CompressorFile:
             try:
                 await self._lane.call(self._run, keep, path, state, boot_of(self._clock))
             except OSError as error:
-                text = f"the next start will not know when the compressor last ran: {error}"
-                self._hub.publish(Event(self._clock.now_ns(), "warning", "compressor_not_kept", text))
+                self._hub.publish(COMPRESSOR_NOT_KEPT.at(self._clock.now_ns(), str(error)))
 
 
 def _here(function: Callable[..., object], *arguments: object) -> object:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from drivers.devices.protocols import Controller
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError
+from foundation.events import PERMIT_NOT_RENEWED, SWITCHED_OFF
 from foundation.hub import Hub
-from foundation.items import Event
 from stand.chamber.permits import Permission, Permits
 from stand.fault import value_of
 
@@ -46,7 +46,7 @@ class Keeper:
                 kept_by = type(error), error.device
                 if self._kept_by != kept_by:
                     self._kept_by = kept_by
-                    self._tell("permit_not_renewed", f"heating and cooling permits not renewed: {error}")
+                    self.hub.publish(PERMIT_NOT_RENEWED.at(self.clock.now_ns(), str(error)))
             period_s = self.renew_s if self.permits.granted else min(self.renew_s, SUPERVISED_S)
             due_ns = max(due_ns + seconds_ns(period_s), self.clock.now_ns())
             await self.clock.sleep_until(due_ns)
@@ -73,8 +73,5 @@ class Keeper:
             return
         self.permits.intrusions += 1
         await self.regulator.make_safe()
-        text = f"{self.regulator.name} ran without permission ({', '.join(found)} above 0); stopped"
-        self._tell("switched_off", text, {"device": self.regulator.name, "times": self.permits.intrusions})
-
-    def _tell(self, kind: str, text: str, data: Mapping[str, object] | None = None) -> None:
-        self.hub.publish(Event(self.clock.now_ns(), "warning", kind, text, data or {}))
+        device, times = self.regulator.name, self.permits.intrusions
+        self.hub.publish(SWITCHED_OFF.at(self.clock.now_ns(), ", ".join(found), device=device, times=times))

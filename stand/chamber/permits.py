@@ -17,8 +17,19 @@ from drivers.devices.protocols import Switches
 from drivers.devices.relays import HEAT
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault
+from foundation.events import (
+    COMPRESSOR_DROPPED,
+    COMPRESSOR_NOT_ON,
+    COMPRESSOR_SWITCHED,
+    DEAD_MAN_LATE,
+    DEAD_MAN_TESTED,
+    HEATER_DROPPED,
+    HEATER_NOT_ON,
+    LEFT_ON,
+    SWITCHED_OFF,
+    EventKind,
+)
 from foundation.hub import Hub
-from foundation.items import Event
 from stand.chamber.compressor import CompressorState, decide
 from stand.config.stand_config import CompressorConfig
 
@@ -123,7 +134,7 @@ class Permits:
         left_on = {name for name, on in (await self._coils()).items() if on} & set(WATCHED)
         await self._relays.make_safe()
         for channel in sorted(left_on):
-            self._tell("left_on", f"{self.name}.{channel} was on; switched off", channel)
+            self._say_of(LEFT_ON, channel)
         if COMPRESSOR in left_on:
             self._set(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
         self._are_off()
@@ -164,24 +175,22 @@ class Permits:
         for test in range(_TEST_TRIES):
             if (found := await self._timer_found(is_timed)) is not None:
                 break
-            text = (
-                f"{self.name}: this computer was held up while the relay's timer was tested; that test does not count"
-            )
-            self._hub.publish(Event(self._clock.now_ns(), "warning", "dead_man_late", text, {"test": test + 1}))
+            self._hub.publish(DEAD_MAN_LATE.at(self._clock.now_ns(), device=self.name, test=test + 1))
         else:
             text = "its timer could not be tested: this computer was held up in each of the tests; see what loads it"
             raise DeviceFault(self.name, text)
         on, off, held_s = found
-        data: dict[str, object] = {"rearmed": on, "dropped": off, "pulse_s": self._limits.self_test_s}
+        tested = {"rearmed": on, "dropped": off, "pulse_s": self._limits.self_test_s}
+        data: dict[str, object] = {"device": self.name, **tested}
         if is_timed:
             data["held_s"] = held_s
         if on and off:
-            text = f"{self.name}: the heater's relay is held by timed commands and drops without them"
-            self._hub.publish(Event(self._clock.now_ns(), "info", "dead_man_tested", text, data))
+            text = "the heater's relay is held by timed commands and drops without them"
+            self._hub.publish(DEAD_MAN_TESTED.at(self._clock.now_ns(), text, **data))
             return
         fault = "does not drop by itself when its time is over" if on else "does not start its time again when re-armed"
         text = f"this board is not suited: a timed-on of the heater's relay {fault}; heat could not be guarded with it"
-        self._hub.publish(Event(self._clock.now_ns(), "error", "dead_man_tested", f"{self.name}: {text}", data))
+        self._hub.publish(DEAD_MAN_TESTED.at(self._clock.now_ns(), text, **data))
         raise DeviceFault(self.name, text)
 
     async def _timer_found(self, is_timed: bool) -> tuple[bool, bool, float | None] | None:
@@ -231,13 +240,10 @@ class Permits:
                     CompressorState(False, now_ns if early else min(now_ns, until_ns), self._compressor.starts_ns)
                 )
             if early and not came_on:
-                text = f"{self.name}.{channel} does not come on: the board confirms its command and reads off"
-                self._tell(f"{channel}_not_on", text, channel)
+                self._say_of(HEATER_NOT_ON if channel == HEATER else COMPRESSOR_NOT_ON, channel)
             elif early:
                 left_s = (until_ns - now_ns) / NS_PER_S
-                rest = "; it counts as a stop, and the compressor rests" if channel == COMPRESSOR else ""
-                text = f"{self.name}.{channel} is off {left_s:.1f} s before its time: something else switched it{rest}"
-                self._tell(f"{channel}_dropped", text, channel)
+                self._say_of(HEATER_DROPPED if channel == HEATER else COMPRESSOR_DROPPED, channel, left_s=left_s)
 
     async def _arm_compressor(self, mv_heat: float, mv_cool: float) -> None:
         wanted = decide(self._compressor, self._limits.compressor, mv_heat, mv_cool, self._clock.now_ns())
@@ -251,8 +257,8 @@ class Permits:
             self._until_ns.pop(COMPRESSOR, None)
         self._set(wanted)
         if switched:
-            text = "compressor started" if wanted.running else "compressor stopped"
-            self._hub.publish(Event(self._clock.now_ns(), "info", "compressor", text, {"running": wanted.running}))
+            said = "started" if wanted.running else "stopped"
+            self._hub.publish(COMPRESSOR_SWITCHED.at(self._clock.now_ns(), said, running=wanted.running))
 
     async def _intruded(self, channel: str) -> None:
         """It was switched on, and not by this daemon."""
@@ -261,7 +267,7 @@ class Permits:
         await self._relays.switch(channel, on=False)
         if channel == COMPRESSOR:
             self._set(CompressorState(False, self._clock.now_ns(), (*self._compressor.starts_ns, now_ns)))
-        self._tell("switched_off", f"{self.name}.{channel} was on without permission; switched off", channel)
+        self._say_of(SWITCHED_OFF, channel)
 
     async def _hold_on(self, channel: str) -> None:
         """Armed from the instant of the call at the earliest."""
@@ -290,6 +296,6 @@ class Permits:
         readings = await self._relays.read()
         return {reading.channel.partition(".")[2]: reading.value == 1 for reading in readings}
 
-    def _tell(self, kind: str, text: str, channel: str) -> None:
-        data: dict[str, object] = {"relay": channel, "times": self.intrusions}
-        self._hub.publish(Event(self._clock.now_ns(), "warning", kind, text, data))
+    def _say_of(self, kind: EventKind, channel: str, **data: object) -> None:
+        now_ns = self._clock.now_ns()
+        self._hub.publish(kind.at(now_ns, device=self.name, relay=channel, times=self.intrusions, **data))

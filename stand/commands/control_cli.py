@@ -22,7 +22,7 @@ from foundation.output import output, show
 from foundation.usage import one_line
 from stand.commands.reached import ConfigOption, DirectoryArgument, TokenOption, UrlOption, on_stand, reached
 from stand.commands.sessions.session_text import size
-from stand.gate import ENDINGS, INTERLOCK, OPERATOR, STOPPING
+from stand.gate import ENDINGS, HELD, INTERLOCK, OPERATOR, STOPPING
 from stand.serving.client import API, Answer, Server
 from stand.serving.desk import FaultState, RunStatus, StandState
 from stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
@@ -234,7 +234,7 @@ def _next(state: StandState) -> Iterator[str]:
         ended = {} if state.run is not None else {"action": "hold"}  # a run that has tripped is over: to be cleared
         yield next_command(f"guard.{state.fault.rule}", {**state.fault.data, **ended})
     for reason in sorted({*state.reasons, *(() if state.run is None else state.run.reasons)} - {INTERLOCK, STOPPING}):
-        yield next_command("held", {"reason": reason})
+        yield next_command(HELD, {"reason": reason})
 
 
 def _show_plan(server: Server) -> None:

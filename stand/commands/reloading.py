@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from foundation.errors import ConfigError
+from foundation.events import TOKENS_NOT_READ, TOKENS_READ
 from foundation.items import Event
 from stand.config.interface_section import TokenFile, load_tokens
 from stand.serving.api.token_book import TokenBook
@@ -44,8 +45,7 @@ class Reloading:
             try:
                 event = self._renewed(await asyncio.to_thread(self._load))
             except ConfigError as error:
-                text = f"{error}; the tokens stay as they were"
-                event = Event(self._now_ns(), "warning", "tokens_not_read", text)
+                event = TOKENS_NOT_READ.at(self._now_ns(), str(error))
             self._tell(event)
 
     def _load(self) -> TokenFile:
@@ -60,8 +60,8 @@ class Reloading:
         added = sorted(name for name, token in now.items() if before.get(name) != token)
         changes = [f"{name} is let in" for name in added]
         changes += [f"{name} is not let in any more" for name in revoked if name not in now]
-        text = f"tokens were read again: {', '.join(changes) or 'nothing has changed'}"
-        return Event(self._now_ns(), "info", "tokens_read", text, {"added": added, "revoked": revoked})
+        said = ", ".join(changes) or "nothing has changed"
+        return TOKENS_READ.at(self._now_ns(), said, added=added, revoked=revoked)
 
 
 def _has_terminal() -> bool:

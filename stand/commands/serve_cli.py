@@ -15,6 +15,7 @@ from foundation.clock import WallClock
 from foundation.command_app import App
 from foundation.documents import read_document
 from foundation.errors import ConfigError
+from foundation.events import KINDS, LOOPBACK_TRUSTED, OPEN
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.output import Output, json_line, output, say
@@ -85,14 +86,12 @@ def serve(
         async with serve_clients(desk, hub, clock, directory, stand.name, served, desk.patience):
             where = f"; http://{host}:{port}/" if port is not None else ""
             where += f"; SECoP at {secop_port}" if secop_port is not None else ""
-            opened = f"{stand.name} is open; sessions go to {directory}{where}"
-            event = Event(clock.now_ns(), "info", "open", opened, {"sessions": str(directory), "port": port})
-            _tell_json(event) if output().as_json else say(opened)
+            event = OPEN.at(clock.now_ns(), where, stand=stand.name, sessions=str(directory), port=port)
+            _tell_json(event) if output().as_json else say(event.text)
             with _events_shown(hub):
                 if secrets is not None and trusts and (port is not None or others):
                     may = "may look at this stand and stop it" if trusts == "read-only" else "operates this stand"
-                    text = f"every program of this machine {may} without a token (trust_loopback)"
-                    hub.publish(Event(clock.now_ns(), "warning", "loopback_trusted", text))
+                    hub.publish(LOOPBACK_TRUSTED.at(clock.now_ns(), may))
                 Reloading(secrets, book, clock.now_ns, hub.publish).begin()
                 yield
 
@@ -148,4 +147,4 @@ def _tell_json(event: Event) -> None:
 def _is_shown(event: Event, wanted: Output) -> bool:
     if wanted.quiet:
         return event.level == "error"
-    return wanted.verbose or event.level != "info" or event.kind in ("queue", "command", "tokens_read")
+    return wanted.verbose or event.level != "info" or KINDS[event.kind].is_shown

@@ -11,6 +11,7 @@ from collections.abc import Awaitable
 from drivers.devices.protocols import Camera
 from foundation.clock import NS_PER_S, Clock
 from foundation.errors import DeviceError, StandError, StandTripped, Superseded
+from foundation.events import DEAD_MAN_TESTED, HOME_RESIDUAL, HOME_RESIDUAL_LARGE
 from foundation.items import Event, Item
 from foundation.readings import Quality
 from stand.assembly import Assembly
@@ -50,9 +51,9 @@ class Moves:
         except StandError as error:
             text = error.text if isinstance(error, DeviceError) else str(error)
             to_do = "nothing may be heated with it: take a board with a timer that re-arms, and look at the wiring"
-            self._add(Finding(name, what, "failed", text, to_do, self._last("dead_man_tested")))
+            self._add(Finding(name, what, "failed", text, to_do, self._last(DEAD_MAN_TESTED)))
             return
-        data = self._last("dead_man_tested")
+        data = self._last(DEAD_MAN_TESTED)
         if not devices.relays.has_timer:
             self._add(Finding(name, what, "ok", "no relay board, so none to be measured"))
             return
@@ -109,9 +110,9 @@ class Moves:
             text = f"homed in {took_s:.1f} s; it had no home before, so there is nothing to compare"
             self._add(Finding(name, "home", "ok", text, data={"took_s": took_s}))
             return
-        data = {**self._last("home_residual", "home_residual_large"), "took_s": took_s}
+        data = {**self._last(HOME_RESIDUAL, HOME_RESIDUAL_LARGE), "took_s": took_s}
         text = f"its home was off by {data['residual']} {data['unit']} ({data['steps']} steps)"
-        if any(event.kind == "home_residual_large" and event.data.get("axis") == name for event in self._events):
+        if any(event.kind == HOME_RESIDUAL_LARGE and event.data.get("axis") == name for event in self._events):
             to_do = "it has lost steps, or its switch moves: look at load, speed and switch, and check again"
             self._add(Finding(name, "home", "warning", text, to_do, data))
             return

@@ -17,11 +17,24 @@ from pydantic import JsonValue
 from drivers.devices.relays import CAMERA_POWER
 from foundation.clock import NS_PER_S, WallClock, seconds_ns
 from foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
-from foundation.events import RUN_FAILED
+from foundation.events import (
+    BY_HAND_FAILED,
+    CAMERA_NOT_OPENED,
+    GUARD,
+    HOUSE_NOT_ENDED,
+    HOUSE_NOT_RECORDED,
+    NOT_RESUMED,
+    QUEUE,
+    QUEUE_EMPTY,
+    QUEUE_NOT_CLEARED,
+    RECORDING_RESTARTED,
+    RUN_END,
+    RUN_FAILED,
+    EventKind,
+)
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.tasks import cancelled, failure_text, watched
-from recording.reading.contents import RUN_END
 from recording.writing.recorder import FINISH_WITHIN_S
 from stand.daemon import systemd
 from stand.daemon.by_hand import ByHand
@@ -231,7 +244,7 @@ class Daemon:
             self._is_draining = True
             try:
                 await drain(directory, self._run_one, self._clock, self._say, disk, self.open_stand.patience)
-                self._tell("info", "queue_empty", "all that was queued is done")
+                self._tell(QUEUE_EMPTY)
             except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
                 self._say(f"the queue is halted: {failure_text(error)}")
                 await self._restart_recording()
@@ -255,9 +268,9 @@ class Daemon:
             session = next(entry.session for entry in self.orders.queued.entries if entry.id == self._run_id)
             await self.orders.resume(session)
         except StandError as error:
-            self._tell("error", "not_resumed", f"run {self._run_id} is not resumed by itself: {error}")
+            self._tell(NOT_RESUMED, str(error), run=self._run_id)
             return
-        self._tell("warning", "recording_restarted", f"{session}: its writer was killed; the run is resumed")
+        self._tell(RECORDING_RESTARTED, session=session)
         self.wake()
 
     async def _run_one(self, entry: Entry, notes: Notes) -> Path:
@@ -288,7 +301,7 @@ class Daemon:
             return await self.orders.run_one(entry, notes, begun, self._say)
         except StandError as error:
             if not has_begun and not isinstance(error, Interrupted):
-                self._tell("error", RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
+                self._tell(RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
             raise
         finally:
             self._hub.unsubscribe(follow)
@@ -307,9 +320,7 @@ class Daemon:
         except (SessionError, OSError) as error:
             self.open_stand.recorder = None
             self._assembly.stand.safety.demand()
-            self._tell(
-                "error", "house_not_recorded", f"nothing is recorded between runs, so nothing is heated: {error}"
-            )
+            self._tell(HOUSE_NOT_RECORDED, str(error))
 
     async def _hand_over(self) -> None:
         """The run records, and its session is known."""
@@ -326,7 +337,7 @@ class Daemon:
         try:
             await self.record.end(FINISH_WITHIN_S)
         except (SessionError, OSError) as error:
-            self._tell("warning", "house_not_recorded", str(error))
+            self._tell(HOUSE_NOT_ENDED, str(error))
 
     async def _look_after(self) -> None:
         """Midnight, a record that has ended by itself, what is kept for the next start, and what systemd shows."""
@@ -373,14 +384,14 @@ class Daemon:
         try:
             recorder = await self.record.begin()
         except (SessionError, OSError) as error:
-            self._tell("warning", "house_not_recorded", f"today's record is not begun, yesterday's goes on: {error}")
+            self._tell(HOUSE_NOT_ENDED, f"today's record is not begun, yesterday's goes on: {error}")
             return
         if self.open_stand.guest is None:
             self.open_stand.recorder = recorder
         try:
             await self.record.complete(FINISH_WITHIN_S)
         except (SessionError, OSError) as error:
-            self._tell("warning", "house_not_recorded", str(error))
+            self._tell(HOUSE_NOT_ENDED, str(error))
 
     async def _adopt_camera(self) -> None:
         """A camera that is found powered is opened; one that is off stays off until somebody wants it."""
@@ -391,7 +402,7 @@ class Daemon:
         try:
             await stand.imaging.supply.switch_on()
         except (DeviceError, StandTripped) as error:
-            self._tell("warning", "camera_not_opened", f"the camera is powered, and cannot be opened: {error}")
+            self._tell(CAMERA_NOT_OPENED, str(error))
 
     async def _feed(self) -> None:
         """Feed the watchdog while guard and loop are on time: a disk that hangs is no reason to be killed."""
@@ -412,7 +423,7 @@ class Daemon:
         try:
             await self.orders.clear()
         except SessionError as error:
-            self._tell("warning", "queue", str(error))
+            self._tell(QUEUE_NOT_CLEARED, str(error))
         self.wake()
 
     def _check_heat(self) -> None:
@@ -430,15 +441,15 @@ class Daemon:
 
     def _follow(self, item: Item) -> None:
         """The hub's subscriber: what has led to a trip is counted when the daemon is killed after it."""
-        if isinstance(item, Event) and item.kind.startswith("guard."):
+        if isinstance(item, Event) and item.kind.startswith(GUARD):
             self.note()
 
     def _say(self, line: str) -> None:
-        self._tell("info", "queue", line)
+        self._tell(QUEUE, line)
 
-    def _tell(self, level: str, kind: str, text: str) -> None:
-        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
+    def _tell(self, kind: EventKind, said: str = "", /, **data: object) -> None:
+        self._hub.publish(kind.at(self._clock.now_ns(), said, **data))
 
     def _tell_failure(self, what: str, ended: asyncio.Future[object]) -> None:
         if not ended.cancelled() and (error := ended.exception()) is not None:
-            self._tell("warning", "by_hand_failed", f"{what}: {failure_text(error)}")
+            self._tell(BY_HAND_FAILED, failure_text(error), what=what)

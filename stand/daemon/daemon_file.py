@@ -14,9 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from foundation.calls import Lane
 from foundation.clock import Clock
+from foundation.events import DAEMON_NOT_KEPT
 from foundation.files import replace_file
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.patience import Patience
 from foundation.sealed import seal, unseal
 
@@ -84,5 +84,4 @@ class KeptFile:
                 data = seal(_KIND, kept.model_dump_json(indent=1))
                 await self._lane.call(self._run, replace_file, self._path, data)
             except (OSError, TimeoutError) as error:
-                text = f"counters are not kept for the next start: {error}"
-                self._hub.publish(Event(self._clock.now_ns(), "warning", "daemon_not_kept", text))
+                self._hub.publish(DAEMON_NOT_KEPT.at(self._clock.now_ns(), str(error)))

@@ -21,12 +21,12 @@ from pathlib import Path
 from foundation.calls import Lane
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
+from foundation.events import IDLE_LOGS_REMOVED, RUN_END
 from foundation.hub import Hub, Subscriber
-from foundation.items import Event, Item
+from foundation.items import Item
 from foundation.patience import Patience
 from foundation.tasks import cancelled
 from recording.exporting.archive import DELETED
-from recording.reading.contents import RUN_END
 from recording.reading.notes import read_notes
 from recording.reading.run_word import Run
 from recording.reading.session import Session
@@ -134,7 +134,7 @@ class DayRecord:
         if self._now is None:
             return
         recording, self._now = self._now, None
-        ended = Event(self._clock.now_ns(), "info", RUN_END, "the record between runs ends", {"status": Run.COMPLETE})
+        ended = RUN_END.at(self._clock.now_ns(), "the record between runs ends", status=Run.COMPLETE)
         recording.tap.give(ended)
         recording.tap.close()
         self._cut_off.append(recording)
@@ -144,9 +144,7 @@ class DayRecord:
         days = self._assembly.config.recording.idle_log_days
         removed = await self._removing.call(remove_idle_logs, self._out, self._today(), days) if days else []
         if removed:
-            text = f"records between runs older than {days} days were removed: {', '.join(removed)}"
-            event = Event(self._clock.now_ns(), "info", "idle_logs_removed", text, {"names": [*removed], "days": days})
-            self._assembly.hub.publish(event)
+            self._assembly.hub.publish(IDLE_LOGS_REMOVED.at(self._clock.now_ns(), names=[*removed], days=days))
 
     def _today(self) -> str:
         now_s = (self._clock.now_ns() + self._clock.utc_offset_ns()) / NS_PER_S

@@ -10,9 +10,9 @@ from pathlib import Path
 from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import StandError
+from foundation.events import NOT_REPORTED, REPORT, REPORTED, EventKind
 from foundation.helper import Helper
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.tasks import cancelled, failure_text
 from stand.running.session_report import report_session
 from stand.serving.preview_process import MODULE
@@ -54,17 +54,17 @@ class Reports:
             try:
                 helper = Helper(MODULE, (_REPORT,), "the process that makes reports has ended")
                 for line in await lane.call(helper.line(_REPORT).run, session_report, str(session)):
-                    self._tell("warning", "report", f"{session.name}: {line}")
-                self._tell("info", "reported", f"the report of {session.name} is made; the page has it under Sessions")
+                    self._tell(REPORT, line, session=session.name)
+                self._tell(REPORTED, session=session.name)
             except (StandError, OSError) as error:
-                self._tell("warning", "not_reported", str(error))
+                self._tell(NOT_REPORTED, str(error))
             except Exception as error:  # noqa: BLE001 - a fit that fails ends nothing
                 remedy = f"`compensate report {session} -o report.html` tries again"
-                self._tell("warning", "not_reported", f"{session.name}: no report: {failure_text(error)}; {remedy}")
+                self._tell(NOT_REPORTED, f"{session.name}: no report: {failure_text(error)}; {remedy}")
             finally:
                 if helper is not None:
                     helper.close()
                 lane.close()
 
-    def _tell(self, level: str, kind: str, text: str) -> None:
-        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
+    def _tell(self, kind: EventKind, said: str = "", /, **data: object) -> None:
+        self._hub.publish(kind.at(self._clock.now_ns(), said, **data))

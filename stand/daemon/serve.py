@@ -9,9 +9,9 @@ from pathlib import Path
 
 from foundation.clock import WallClock
 from foundation.errors import StandTripped
+from foundation.events import DAEMON_FILE_DAMAGED, LIMITS_ACCEPTED, SALVAGED
 from foundation.files import make_folder
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.repeats import RepeatLimit
 from recording.repair.salvage import salvage_line, salvage_unfinished
 from recording.writing.disk import FILES_LINE
@@ -74,11 +74,11 @@ async def serve(
                     open_stand, open_stand.disk, out, config_name, texts, reports.add if has_reports else None
                 )
                 for segment in await orders.repair.call(salvage_unfinished, out):
-                    hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
+                    hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
                 if accepted := config.accepted():
-                    hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
+                    hub.publish(LIMITS_ACCEPTED.at(clock.now_ns(), accepted_text(accepted), **accepted))
                 if damage:
-                    hub.publish(Event(clock.now_ns(), "warning", "daemon_file_damaged", damage))
+                    hub.publish(DAEMON_FILE_DAMAGED.at(clock.now_ns(), damage))
                 daemon = Daemon(open_stand, orders, record, kept, keep, latched)
                 await daemon.serve(lambda hub, clock: front(DaemonDesk(daemon), hub, clock))
             if unsafe := assembly.stand.safety.unconfirmed:

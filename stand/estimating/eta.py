@@ -12,11 +12,11 @@ from typing import Any, cast
 
 from experiments.steps import estimate_s, frames_of, kind_of, number_steps, step_of
 from foundation.clock import NS_PER_S
+from foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, PLAN_CHANGED, SOAK_LONGER, TO_AMBIENT
 from foundation.items import Event, StepMark, StepState
-from recording.reading.contents import PLAN_CHANGED
 from stand.estimating.estimate import PricedStep
+from stand.gate import HELD, RELEASED
 
-SOAK_LONGER = "soak_longer"  # the event that a soak goes on beyond its time, for by_s at least
 _REMEMBERED = 9  # the last measurements of a kind of work count
 _LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
 _LEAST_WITHIN_S = 60.0
@@ -121,10 +121,10 @@ class Eta:
         """`held`, `released`: a reason to wait came or went; while there is one, the running step gets no further.
         `plan_changed`: an operator has changed what is still to be done. `soak_longer`: the soak under way goes on
         beyond its time. `to_ambient`, `at_ambient`, `not_at_ambient`: the way back begins or ends."""
-        if event.kind == "held":
+        if event.kind == HELD:
             self._held_since_ns = event.time_ns if self._held_since_ns is None else self._held_since_ns
             self._reasons.add(event.data.get("reason"))
-        elif event.kind == "released":
+        elif event.kind == RELEASED:
             self._reasons.discard(event.data.get("reason"))
             if self._held_since_ns is not None and not self._reasons:
                 self._held_ns += event.time_ns - self._held_since_ns
@@ -132,9 +132,9 @@ class Eta:
         elif event.kind in (PLAN_CHANGED, SOAK_LONGER):
             self.goes_on |= event.kind == SOAK_LONGER
             self._change(event.data)
-        elif event.kind == "to_ambient":
+        elif event.kind == TO_AMBIENT:
             self._after_since_ns = event.time_ns
-        elif event.kind in ("at_ambient", "not_at_ambient"):
+        elif event.kind in (AT_AMBIENT, NOT_AT_AMBIENT):
             self._after_s = 0.0
 
     def left_s(self, now_ns: int) -> float:

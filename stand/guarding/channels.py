@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from statistics import median
 
 from foundation.clock import NS_PER_S
-from foundation.events import SENSOR, guard_rule
+from foundation.events import SENSOR, SENSOR_BELIEVED, guard_kind, guard_rule
 from foundation.items import Event
 from foundation.readings import Quality, Reading
 from stand.config.chamber_section import FrozenConfig
@@ -388,13 +388,12 @@ class ChannelCheck:
 
     def _warn(self, rule: str, channels: list[str], text: str, now_ns: int, more: Mapping[str, object]) -> None:
         data: dict[str, object] = {"rule": rule, "action": "warn", "channels": channels, **more}
-        self._publish(Event(now_ns, "warning", f"guard.{rule}", text, data))
+        self._publish(guard_kind(rule).at(now_ns, text, **data))
 
     def _say_good(self, channel: str, value: float, was: _Doubted, now_ns: int) -> None:
         lasted_s = (now_ns - was.time_ns) / NS_PER_S
-        text = f"{channel} is believed again, at {value:.2f} degC, after {lasted_s:.0f} s in doubt: {was.text}"
-        data: dict[str, object] = {"rule": was.rule, "channels": [channel], "doubted_s": lasted_s}
-        self._publish(Event(now_ns, "info", "sensor_believed", text, data))
+        data = {"rule": was.rule, "channels": [channel], "doubted_s": lasted_s, "value_degC": value}
+        self._publish(SENSOR_BELIEVED.at(now_ns, was.text, **data))
 
 
 def _share(time_s: float, lag_s: float) -> float:

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError
-from foundation.events import guard_rule
+from foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, NOTIFY_FAILED, guard_rule
 from foundation.hub import Hub
-from foundation.items import Event
 from stand.fault import Fault
 from stand.guarding.interlocks import NOT_RECORDED, Watch
 from stand.guarding.met_errors import MetErrors
@@ -134,9 +133,7 @@ class Guard:
         if fault is None or fault.rule != NOT_RECORDED or not fault.ends_itself or self.release is None:
             return
         self.held = None
-        text = f"the recording ended while the disk held it up; nothing is heated before another begins: {fault.text}"
-        data: dict[str, object] = {"rule": fault.rule}
-        self.hub.publish(Event(self.clock.now_ns(), "warning", "hold_ended", text, data))
+        self.hub.publish(HOLD_ENDED.at(self.clock.now_ns(), fault.text, rule=fault.rule))
         self.release()
 
     async def run(self) -> None:
@@ -202,13 +199,12 @@ class Guard:
             )
             self.held = Fault(fault.rule, text, fault.action)
             self.latch(self.held)
-            self.hub.publish(Event(now_ns, "error", "hold_stays", text, data))
+            self.hub.publish(HOLD_STAYS.at(now_ns, text, **data))
             self._notify(text)
             return
         self._endings_ns.append(now_ns)
         self.held = None
-        text = f"the stand is held no longer, and continues; it was held because {fault.text}"
-        self.hub.publish(Event(now_ns, "warning", "hold_ended", text, data))
+        self.hub.publish(HOLD_ENDED.at(now_ns, fault.text, **data))
         self.release()
 
     def _note_time(self) -> None:
@@ -219,9 +215,7 @@ class Guard:
             return
         self._late_ns, self._fresh_after_ns = now_ns, now_ns + seconds_ns(_STRADDLING_S)
         gap_s = (now_ns - looked_ns) / NS_PER_S
-        text = f"the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up"
-        data: dict[str, object] = {"gap_s": gap_s, "from_ns": looked_ns, "to_ns": now_ns}
-        self.hub.publish(Event(now_ns, "warning", "guard_late", text, data))
+        self.hub.publish(GUARD_LATE.at(now_ns, gap_s=gap_s, from_ns=looked_ns, to_ns=now_ns))
 
     def _faults(self) -> list[Fault]:
         """Those that trip; those that only warn are published when they begin. Every rule is asked: some remember."""
@@ -239,8 +233,7 @@ class Guard:
                 self._warned.discard(index)
             elif index not in self._warned:
                 self._warned.add(index)
-                data: dict[str, object] = {"rule": fault.rule, **fault.data}
-                self.hub.publish(Event(now_ns, "warning", f"guard.{fault.rule}", fault.text, data))
+                self.hub.publish(fault.at(now_ns))
         return faults
 
     def _make_safe(self, fault: Fault) -> None:
@@ -248,8 +241,7 @@ class Guard:
         self.safety.demand()
         if fault.cuts_camera and self.cut_camera is not None:
             self.cut_camera()
-        data: dict[str, object] = {"rule": fault.rule, **fault.data}
-        self.hub.publish(Event(self.clock.now_ns(), "error", f"guard.{fault.rule}", fault.text, data))
+        self.hub.publish(fault.at(self.clock.now_ns()))
         self._notify(fault.text)
 
     def _notify(self, text: str) -> None:
@@ -265,10 +257,10 @@ class Guard:
         unsafe = self.safety.unconfirmed
         failure = await notifier.tell(f"{text}; NOT SAFE: {'; '.join(unsafe)}" if unsafe else text)
         if failure:
-            self.hub.publish(Event(self.clock.now_ns(), "warning", "notify_failed", failure))
+            self.hub.publish(NOTIFY_FAILED.at(self.clock.now_ns(), failure))
 
     def _tell_deafness(self) -> None:
         """A command that cannot be run is found now, not at the first trip."""
         missing = "" if self.notifier is None else self.notifier.missing()
         if missing:
-            self.hub.publish(Event(self.clock.now_ns(), "warning", "notify_failed", missing))
+            self.hub.publish(NOTIFY_FAILED.at(self.clock.now_ns(), missing))

@@ -8,11 +8,12 @@ from functools import partial
 
 from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from experiments.steps import Capture
+from foundation.events import FRAMES_RESUMED, FRAMES_STOPPED
 from foundation.items import Event, Item, StepMark, StepState
 from stand.config.dew import dew_point_degC
 from stand.config.stand_config import StandConfig
 from stand.fault import Action, Readings, value_of
-from stand.gate import OPERATOR
+from stand.gate import HELD, OPERATOR, RELEASED
 from stand.guarding.channels import LEAST_LAG_S, Nature
 from stand.guarding.drifting import drifting
 from stand.guarding.felt_air import camera_feels, granite_feels
@@ -86,10 +87,10 @@ class Announcements:
         """The hub's subscriber."""
         if isinstance(item, StepMark) and item.kind == Capture.__name__:
             self.is_capturing = item.state is StepState.STARTED
-        elif isinstance(item, Event) and item.kind in ("frames_stopped", "frames_resumed"):
-            self.frames_stopped = item.text if item.kind == "frames_stopped" else ""
-        elif isinstance(item, Event) and item.kind in ("held", "released") and item.data.get("reason") == OPERATOR:
-            self.is_paused = item.kind == "held"
+        elif isinstance(item, Event) and item.kind in (FRAMES_STOPPED, FRAMES_RESUMED):
+            self.frames_stopped = item.text if item.kind == FRAMES_STOPPED else ""
+        elif isinstance(item, Event) and item.kind in (HELD, RELEASED) and item.data.get("reason") == OPERATOR:
+            self.is_paused = item.kind == HELD
 
 
 def safety_thermometers(config: StandConfig) -> tuple[str, ...]:

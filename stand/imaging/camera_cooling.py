@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.events import COOL_DOWN_UNSURE, COOLED_DOWN
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.readings import Quality, Reading
 
 _LOOK_S = 10.0
@@ -46,7 +46,7 @@ async def cool_down(
     if cooling is None:
         await clock.sleep_until(deadline_ns)
         text = f"the camera gave no temperature before it was switched off; waited {max_s:g} s"
-        hub.publish(Event(clock.now_ns(), "warning", "cool_down_unsure", text))
+        hub.publish(COOL_DOWN_UNSURE.at(clock.now_ns(), text))
         return
     while True:
         now_ns, air = clock.now_ns(), hub.latest("thermometers.air")
@@ -57,10 +57,11 @@ async def cool_down(
         if abs(excess_K) <= band_K or now_ns >= deadline_ns:
             break
         await clock.sleep_until(min(deadline_ns, now_ns + seconds_ns(_LOOK_S)))
-    waited = f"after {(now_ns - begin_ns) / NS_PER_S:.0f} s the camera should be {excess_K:+.2f} K from the air"
+    waited_s = (now_ns - begin_ns) / NS_PER_S
     if abs(excess_K) <= band_K:
-        hub.publish(Event(now_ns, "info", "cooled_down", f"{waited}, within {band_K:g} K"))
+        hub.publish(COOLED_DOWN.at(now_ns, waited_s=waited_s, excess_K=excess_K, band_K=band_K))
         return
+    found = f"after {waited_s:.0f} s the camera should be {excess_K:+.2f} K from the air"
     if math.isinf(excess_K):
-        waited = "the air near the camera is not measured"
-    hub.publish(Event(now_ns, "warning", "cool_down_unsure", f"{waited}; continuing outside {band_K:g} K"))
+        found = "the air near the camera is not measured"
+    hub.publish(COOL_DOWN_UNSURE.at(now_ns, f"{found}; continuing outside {band_K:g} K"))

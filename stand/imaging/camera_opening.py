@@ -7,8 +7,9 @@ from collections.abc import Awaitable, Callable
 
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
+from foundation.events import CAMERA_BACK
 from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
+from foundation.items import Batch, Item
 from stand.imaging.cameras import Cameras
 
 LOST_LIMIT_S = 1800.0
@@ -81,7 +82,7 @@ class CameraOpening:
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
             else:
                 text = "the camera was lost and answers again; its settings are written and read back"
-                self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", text))
+                self._hub.publish(CAMERA_BACK.at(self._clock.now_ns(), text))
         self._given_up = self._is_lost()
 
     async def _open(self) -> None:

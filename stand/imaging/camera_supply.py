@@ -12,8 +12,8 @@ from drivers.devices.relays import CAMERA_POWER
 from drivers.settings import EquilibriumSettings
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, Unreachable
+from foundation.events import CAMERA_SUPPLY_OFF
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.tasks import cancelled
 from stand.gate import CAMERA_LOST, Gate
 from stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
@@ -123,9 +123,9 @@ class CameraSupply:
         equilibrium; event `camera_supply_off`."""
         if self.is_on and not coils.get(CAMERA_POWER, True):
             self.is_on = False
-            text = "the camera's supply is off though it was switched on: a brown-out of the relay board, or a person"
-            self._hub.publish(Event(self._clock.now_ns(), "error", "camera_supply_off", text))
-            self.equilibrium.lose(text)
+            off = CAMERA_SUPPLY_OFF.at(self._clock.now_ns())
+            self._hub.publish(off)
+            self.equilibrium.lose(off.text)
 
     async def _supply(self) -> None:
         """Supply on and the camera open. A relay that reads off is only held for some seconds at a time until the

@@ -15,12 +15,11 @@ import numpy as np
 
 from drivers.settings import EquilibriumSettings
 from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LATE, CAMERA_EQUILIBRIUM_LOST, EventKind
 from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
+from foundation.items import Batch, Item
 from foundation.readings import Quality
 from stand.imaging.settling import Float, camera_rate, digit_K, seconds
-
-LOST, REACHED = "camera_equilibrium_lost", "camera_equilibrium"  # kinds of events
 
 CAMERA = "camera.temperature"
 _TIME_CONSTANTS = 5.0
@@ -53,8 +52,7 @@ class CameraEquilibrium:
         """It is lost from now on; event `camera_equilibrium_lost`."""
         self.is_lost = True
         self.begin()
-        text = f"the camera's equilibrium is lost, it is soaked again: {reason}"
-        self._hub.publish(Event(self._clock.now_ns(), "warning", LOST, text, {"reason": reason, **(data or {})}))
+        self._hub.publish(CAMERA_EQUILIBRIUM_LOST.at(self._clock.now_ns(), **{"reason": reason, **(data or {})}))
         for listener in self._listeners:
             listener()
 
@@ -81,7 +79,7 @@ class CameraEquilibrium:
                 return self._reached(now_ns, rate_K_per_min)
             if now_ns >= tell_ns:
                 tell_ns += self._longest_ns
-                self._tell_moving(now_ns, rate_K_per_min)
+                self._say(CAMERA_EQUILIBRIUM_LATE, now_ns, rate_K_per_min)
             await self._clock.sleep_until(now_ns + seconds_ns(_LOOK_S))
 
     @property
@@ -112,20 +110,11 @@ class CameraEquilibrium:
 
     def _reached(self, now_ns: int, rate_K_per_min: float) -> None:
         self.is_lost = False
-        soaked_s = (now_ns - self._since_ns) / NS_PER_S
-        known = not math.isnan(rate_K_per_min)
-        how = f"moves by at most {rate_K_per_min:.3f} K/min" if known else "is not known; five time constants are over"
-        data = {"soaked_s": soaked_s, "rate_K_per_min": rate_K_per_min if known else None}
-        text = f"the camera is in equilibrium after {soaked_s / 60:.0f} min: its temperature {how}"
-        self._hub.publish(Event(now_ns, "info", REACHED, text, data))
+        self._say(CAMERA_EQUILIBRIUM, now_ns, rate_K_per_min)
 
-    def _tell_moving(self, now_ns: int, rate_K_per_min: float) -> None:
-        soaked_s = (now_ns - self._since_ns) / NS_PER_S
-        known = not math.isnan(rate_K_per_min)
-        data = {"soaked_s": soaked_s, "rate_K_per_min": rate_K_per_min if known else None}
-        how = f"moves by up to {rate_K_per_min:.3f} K/min" if known else "is known at times only"
-        text = f"the camera is not in equilibrium after {soaked_s / 60:.0f} min: its temperature {how}; still waiting"
-        self._hub.publish(Event(now_ns, "warning", "camera_equilibrium_late", text, data))
+    def _say(self, kind: EventKind, now_ns: int, rate_K_per_min: float) -> None:
+        soaked_s, rate = (now_ns - self._since_ns) / NS_PER_S, None if math.isnan(rate_K_per_min) else rate_K_per_min
+        self._hub.publish(kind.at(now_ns, soaked_s=soaked_s, rate_K_per_min=rate))
 
     def _receive(self, item: Item) -> None:
         """The hub's subscriber."""

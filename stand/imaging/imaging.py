@@ -10,11 +10,12 @@ from functools import partial
 from drivers.devices.protocols import Camera, Shutter
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import Unreachable
+from foundation.events import CAMERA_BACK, CAMERA_LOST
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.readings import TEMPERATURE_IN_DOUBT, Frame
+from stand import gate as reasons
 from stand.config.stand_config import LEADING
-from stand.gate import CAMERA_LOST, Gate
+from stand.gate import Gate
 from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
 from stand.imaging.camera_supply import CameraSupply
 from stand.interlock import Interlock, Motions
@@ -126,8 +127,8 @@ class Imaging:
         begin_ns, limit_ns = self._clock.now_ns(), seconds_ns(LOST_LIMIT_S)
         if self._without_camera_ns >= limit_ns:
             raise lost
-        self._hub.publish(Event(begin_ns, "warning", "camera_lost", str(lost)))
-        self._gate.hold(CAMERA_LOST)
+        self._hub.publish(CAMERA_LOST.at(begin_ns, str(lost)))
+        self._gate.hold(reasons.CAMERA_LOST)
         deadline_ns = begin_ns + limit_ns - self._without_camera_ns
         supply, proof = self.supply, None
         if self._without_camera_ns:
@@ -139,10 +140,10 @@ class Imaging:
                 self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on, proof=proof
             )
         finally:
-            self._gate.clear(CAMERA_LOST)
+            self._gate.clear(reasons.CAMERA_LOST)
             self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
         if is_back:
-            self._hub.publish(Event(self._clock.now_ns(), "info", "camera_back", "the camera answers again"))
+            self._hub.publish(CAMERA_BACK.at(self._clock.now_ns(), "the camera answers again"))
 
 
 async def grab_together(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from foundation.errors import ConfigError, Interrupted, SessionError, StandError, StandTripped
+from foundation.events import NOT_CONFIRMED_SAFE
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from stand.config.stand_config import StandConfig
@@ -67,7 +68,7 @@ class Watch:
 
     def __call__(self, item: Item) -> None:
         """Follow one item."""
-        if isinstance(item, Event) and item.kind == "not_confirmed_safe":
+        if isinstance(item, Event) and item.kind == NOT_CONFIRMED_SAFE:
             self.unsafe.append(item.text)
         if isinstance(item, StepMark) and item.state is StepState.DONE and item.step_id not in self._done:
             self._step_done()

@@ -14,12 +14,23 @@ from foundation.calls import Lane
 from foundation.clock import VirtualClock, boot_of, utc_offset_ns
 from foundation.documents import parse_document
 from foundation.errors import NotCleared, StandError, StandTripped
+from foundation.events import (
+    CLEARED,
+    FRAMES_RESUMED,
+    FRAMES_STOPPED,
+    GAP,
+    NO_CONTROL,
+    RUN_END,
+    RUN_RESUME,
+    RUN_START,
+    TELEMETRY_NOT_SAVED,
+    TELEMETRY_SAVED_AGAIN,
+)
 from foundation.hub import Hub
 from foundation.instants import duration, local_text
 from foundation.items import Event, Item
 from foundation.tasks import cause_of, failure_text, watched
 from markers.target import Target
-from recording.reading.contents import RUN_END
 from recording.reading.run_word import Run
 from recording.writing.disk import NOTES_LINE, DiskCalls
 from recording.writing.recorder import Recorder
@@ -48,10 +59,10 @@ from stand.serving.api.server import preload, serve
 from stand.serving.eta_slip import EtaSlip
 
 # The recorder's events that hold a run, and those that let it continue.
-_HOLDING = {"frames_stopped": DISK_LOW, "telemetry_not_saved": NOT_RECORDED}
+_HOLDING: dict[str, str] = {FRAMES_STOPPED: DISK_LOW, TELEMETRY_NOT_SAVED: NOT_RECORDED}
 # A run in virtual time that is held for so many times the longest pause ends.
 _VIRTUAL_PAUSES = 2
-_RELEASING = {"frames_resumed": DISK_LOW, "telemetry_saved_again": NOT_RECORDED}
+_RELEASING: dict[str, str] = {FRAMES_RESUMED: DISK_LOW, TELEMETRY_SAVED_AGAIN: NOT_RECORDED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +152,7 @@ class Guest:
                 stop.taking_down()
                 assembly.stand.gate.let_go()  # what an operator presses now holds nothing
                 try:
-                    level = "info" if ended.status == "complete" else "error"
-                    log.tell(level, RUN_END, ended.text, {"status": ended.status})
+                    log.tell(RUN_END, ended.text, status=ended.status)
                 finally:  # also when a subscriber fails
                     await open_stand.rest(watchers)
                     settling.close()
@@ -160,7 +170,7 @@ class Guest:
         )
         await open_stand.read_once()
         if before is None:
-            log.tell("info", "run.start", f"recipe {self.job.order.recipe.name}", self._begin_data())
+            log.tell(RUN_START, **self._begin_data())
         else:
             self._tell_interruption(before)
         if not open_stand.guard.look():
@@ -256,7 +266,7 @@ class Guest:
             ):
                 await asyncio.Event().wait()
         except StandError as error:
-            self.log.tell("warning", "no_control", f"the run cannot be queried or paused: {error}")
+            self.log.tell(NO_CONTROL, f"the run cannot be queried or paused: {error}")
             await asyncio.Event().wait()
 
     def _begin_data(self) -> dict[str, object]:
@@ -264,8 +274,8 @@ class Guest:
         counts of what is done: how many steps and frames the plan has. For who watches: the session. Which packages
         have made steps of it."""
         plan, boot = plan_hash(self.job.order.recipe.plan()), boot_of(self._assembly.clock)
-        size, session = self.log.state.size, self.recorder.directory.name
-        data: dict[str, object] = {**size, "plan": plan, "seed": self.job.seed, "session": session}
+        names = {"recipe": self.job.order.recipe.name, "session": self.recorder.directory.name}
+        data: dict[str, object] = {**self.log.state.size, "plan": plan, "seed": self.job.seed, **names}
         if packages := self.job.order.recipe.packages:
             data["packages"] = packages
         return data if boot is None else {**data, "boot_id": boot.id}
@@ -283,16 +293,13 @@ class Guest:
         now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
         if before.state.ended is None:
             ended = f"interrupted: killed after {local_text(last_utc_ns)}"
-            log.tell("error", RUN_END, ended, {"status": Run.INTERRUPTED})
-        data: dict[str, object] = {"from_ns": last_utc_ns, "to_ns": now_ns + utc_offset_ns(clock)}
-        lasted = duration(now_ns - before.last_ns)
-        log.tell("warning", "gap", f"until now nothing was recorded and nobody watched the stand, for {lasted}", data)
+            log.tell(RUN_END, ended, status=Run.INTERRUPTED)
+        to_utc_ns = now_ns + utc_offset_ns(clock)
+        log.tell(GAP, duration(now_ns - before.last_ns), from_ns=last_utc_ns, to_ns=to_utc_ns)
         if before.state.tripped:
-            log.tell("warning", "cleared", f"cleared before it was resumed: {before.state.tripped}")
+            log.tell(CLEARED, str(before.state.tripped))
         version = importlib.metadata.version("thermostand")
-        done = f"{len(before.kept.done)} steps are done"
-        text = f"recipe {before.order.recipe.name} is resumed, {done}; thermostand {version}"
-        log.tell("info", "run.resume", text, self._begin_data())
+        log.tell(RUN_RESUME, version=version, steps_done=len(before.kept.done), **self._begin_data())
 
 
 def _judge_camera(before: Interruption, assembly: Assembly) -> None:

@@ -17,10 +17,10 @@ from pathlib import Path
 
 from experiments.steps import Capture, PlannedStep
 from foundation.errors import SessionError
+from foundation.events import PLAN_CHANGED, RUN_BEGINS, RUN_END
 from foundation.items import Event, Item, StepMark, StepState
 from foundation.progress import late_progress
 from recording.format.restarts import frames_lost_of, restarted_step
-from recording.reading.contents import PLAN_CHANGED, RUN_BEGINS, RUN_END
 from recording.reading.glance import glance
 from recording.reading.run_word import Run, last_run_event
 from recording.reading.session import Session

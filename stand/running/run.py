@@ -11,6 +11,7 @@ from pathlib import Path
 
 from foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
 from foundation.errors import Interrupted, SessionError, StandError, StandTripped
+from foundation.events import JOURNAL_DAMAGED, LIMITS_ACCEPTED, NOTIFY_FAILED, SALVAGED, STAND_DIFFERS
 from foundation.hub import Hub
 from foundation.instants import utc_text
 from foundation.items import Event, Item
@@ -221,13 +222,13 @@ async def _announce(job: Job, assembly: Assembly, disk: Disk | None = None, *, h
     for segment in await _salvaged(job, assembly.clock, disk):
         if has_own and segment.reason == BEING_RECORDED:
             continue
-        hub.publish(Event(clock.now_ns(), "warning", "salvaged", salvage_line(segment)))
+        hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
     if accepted := job.order.config.accepted():
-        hub.publish(Event(clock.now_ns(), "warning", "limits_accepted", accepted_text(accepted), accepted))
+        hub.publish(LIMITS_ACCEPTED.at(clock.now_ns(), accepted_text(accepted), **accepted))
     if job.before is not None and job.before.journal.damage:
-        hub.publish(Event(clock.now_ns(), "warning", "journal_damaged", job.before.journal.damage))
+        hub.publish(JOURNAL_DAMAGED.at(clock.now_ns(), job.before.journal.damage))
     for difference in () if job.before is None else job.before.differences:
-        hub.publish(Event(clock.now_ns(), "warning", "stand_differs", str(difference), difference.data()))
+        hub.publish(STAND_DIFFERS.at(clock.now_ns(), str(difference), **difference.data()))
 
 
 async def _salvaged(job: Job, clock: Clock, disk: Disk | None) -> tuple[Salvaged, ...]:
@@ -317,7 +318,7 @@ def _check_outcome(directory: Path, recorder: Recorder, assembly: Assembly) -> N
 async def _tell_failure(assembly: Assembly, name: str, error: BaseException) -> None:
     ending = "" if isinstance(error, StandTripped) else _unsafe(assembly)
     if failure := await assembly.notifier.tell(f"{name} has failed: {failure_text(error)}{ending}"):
-        assembly.hub.publish(Event(assembly.clock.now_ns(), "warning", "notify_failed", failure))
+        assembly.hub.publish(NOTIFY_FAILED.at(assembly.clock.now_ns(), failure))
 
 
 def _unsafe(assembly: Assembly) -> str:

@@ -12,6 +12,7 @@ from experiments.steps import PlannedStep, Step, frames_of, kind_of, parameters_
 from experiments.words import in_words
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError, SessionError
+from foundation.events import PROMPT
 from foundation.items import Event, Item, StepMark, StepState
 from recording.writing.disk import DiskCalls
 from stand.assembly import Assembly, device_kinds
@@ -92,8 +93,8 @@ class RunDesk:
                 if self._pausing:
                     self._pausing = False
                     self.assembly.stand.gate.hold(OPERATOR)
-            case Event(kind="prompt", text=text):
-                self._prompt = PromptState(step_id=self.log.state.under_way, text=text)
+            case Event() if item.kind == PROMPT:
+                self._prompt = PromptState(step_id=self.log.state.under_way, text=item.text)
             case _:
                 pass
 

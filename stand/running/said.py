@@ -9,13 +9,11 @@ from pathlib import Path
 
 from foundation.clock import Clock
 from foundation.errors import ConfigError
+from foundation.events import NOTE
 from foundation.hub import Hub
-from foundation.items import Event
 from recording.reading.notes import add_note, add_tags, check_tag
 from recording.writing.disk import DiskCalls
 from stand.serving.desk import Who
-
-_NOTE = "note"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +34,8 @@ class Said:
 async def keep(said: Said, session: Path, hub: Hub, clock: Clock, notes: DiskCalls) -> None:
     """Durable when this returns; SessionError when it is not. `notes` touches the disk, which may hang."""
     await notes.call(_keep, said, session, clock.now_ns())
-    who, data = said.who, {"session": session.name, "tags": list(said.tags)}
-    hub.publish(Event(clock.now_ns(), "info", _NOTE, said.text, {"who": who.name, "how": who.how, **data}))
+    who, tags = said.who, list(said.tags)
+    hub.publish(NOTE.at(clock.now_ns(), said.text, who=who.name, how=who.how, session=session.name, tags=tags))
 
 
 def _keep(said: Said, session: Path, now_ns: int) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from drivers.settings import identity_event
 from foundation.clock import NS_PER_S, Clock, VirtualClock
 from foundation.documents import parse_document
+from foundation.events import ABSENT, SEARCH_FAILED
 from foundation.hub import Hub
 from foundation.items import Event
 from markers.target import Target
@@ -64,7 +65,7 @@ def tell_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
         if device is not None and device.identity is not None:
             tell(identity_event(device.name, device.identity, now_ns))
     for absence in absences(assembly.config):
-        tell(Event(now_ns, "info", "absent", str(absence), {"what": absence.what}))
+        tell(ABSENT.at(now_ns, absence.means, what=absence.what))
 
 
 def recorder_of(
@@ -75,7 +76,7 @@ def recorder_of(
     attachments, hub, clock = order.attachments(), assembly.hub, assembly.clock
     recorder = recorder_in(directory, info, attachments, order.config, hub, clock, disk, encode)
     if encode is not None:
-        encode.tell = partial(recorder.warn, "search_failed")
+        encode.tell = partial(recorder.tell, SEARCH_FAILED)
     return recorder
 
 

@@ -20,7 +20,7 @@ from typing import cast
 
 from foundation.clock import Clock, VirtualClock, boot_time_ns, seconds_ns
 from foundation.errors import ConfigError
-from foundation.events import RUN_FAILED, alert_of
+from foundation.events import ALERT_FAILED, RUN_FAILED, alert_of
 from foundation.helper import Helper
 from foundation.hub import Hub
 from foundation.items import Event, Item
@@ -65,7 +65,7 @@ async def alerting(
     try:
         yield
     except Exception as raised:
-        alerts(Event(clock.now_ns(), "error", RUN_FAILED, failure_text(cause_of(raised))))
+        alerts(RUN_FAILED.at(clock.now_ns(), failure_text(cause_of(raised))))
         raise
     finally:
         hub.unsubscribe(alerts)
@@ -181,6 +181,6 @@ class Alerts:
         if failure in self._failed:
             return
         self._failed.add(failure)
-        event = Event(self._clock.now_ns(), "warning", "alert_failed", f"an alert was not delivered: {failure}")
+        event = ALERT_FAILED.at(self._clock.now_ns(), failure)
         with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._hub.publish, event)

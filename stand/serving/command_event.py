@@ -6,20 +6,17 @@ from collections.abc import Mapping
 
 from pydantic import JsonValue
 
+from foundation.events import COMMAND
 from foundation.items import Event
 from stand.serving.desk import Verb, Who
-
-COMMAND = "command"  # the kind of the event that each command is
 
 
 def command_event(
     time_ns: int, who: Who, verb: Verb, arguments: Mapping[str, JsonValue], result: str = "done"
 ) -> Event:
     """What the recording keeps of a command: who, how, what, and what came of it."""
-    by = who.name or "somebody"
     data = {"who": who.name, "how": who.how, "verb": verb, "arguments": dict(arguments), "result": result}
-    ending = "" if result == "done" else f": {result}"
-    return Event(time_ns, "info", COMMAND, f"{by} ({who.how}): {_in_words(verb, arguments)}{ending}", data)
+    return COMMAND.at(time_ns, _in_words(verb, arguments), **data)
 
 
 def _in_words(verb: Verb, arguments: Mapping[str, JsonValue]) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from foundation.clock import NS_PER_S, Now
+from foundation.events import ETA_SLIPPED, PLAN_CHANGED
 from foundation.hub import Hub
 from foundation.instants import local_text
 from foundation.items import Event, Item, StepMark
+from stand.gate import HELD, RELEASED
 
-ETA_SLIPPED = "eta_slipped"
 _SHARE = 0.1
 _LEAST_S = 300.0  # a minute's slip of a short run is not reported
 
@@ -25,7 +26,7 @@ class EtaSlip:
 
     def __call__(self, item: Item) -> None:
         """Look at the end when a step begins or ends, or something holds the run or lets it go."""
-        is_event = isinstance(item, Event) and item.kind in ("held", "released", "plan_changed")
+        is_event = isinstance(item, Event) and item.kind in (HELD, RELEASED, PLAN_CHANGED)
         if not is_event and not isinstance(item, StepMark):
             return
         now_ns = self._clock.now_ns()
@@ -35,7 +36,5 @@ class EtaSlip:
             return
         self._end_s = end_s
         end_ns = round(end_s * NS_PER_S)
-        text = (
-            f"the run ends {later_s / 60:.0f} min later than expected, at {local_text(end_ns + self._utc_offset_ns())}"
-        )
-        self._hub.publish(Event(now_ns, "info", ETA_SLIPPED, text, {"later_s": round(later_s, 1), "end_ns": end_ns}))
+        at = local_text(end_ns + self._utc_offset_ns())
+        self._hub.publish(ETA_SLIPPED.at(now_ns, at, later_s=round(later_s, 1), end_ns=end_ns))

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from foundation.calls import Line
 from foundation.clock import Clock
 from foundation.errors import StandError
+from foundation.events import PREVIEW, RUN_BEGINS, RUN_RESUME, RUN_START
 from foundation.helper import Helper
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepMark, StepState
@@ -34,7 +35,6 @@ _SOONEST_S = 0.4  # between two frames that are looked at
 _AGAIN_S = 30.0  # before a process that has ended is started again
 _LOOK, _READ, _SEARCH = "look", "read", "search"  # what is asked for on one line never waits for another's
 _ENDED = "the process that looks at frames for the page has ended"
-_RUN_START, _RUN_RESUME = "run.start", "run.resume"
 
 
 class Viewing:
@@ -73,8 +73,8 @@ class Viewing:
                 self.skipped += 1
             self._newest[camera] = (item, self._roles.get(item.step_id, ""))
             return
-        if isinstance(item, Event) and item.kind in (_RUN_START, _RUN_RESUME):
-            self._has_to_recall = item.kind == _RUN_RESUME
+        if isinstance(item, Event) and item.kind in RUN_BEGINS:
+            self._has_to_recall = item.kind == RUN_RESUME
         if isinstance(item, StepMark) and item.state is StepState.STARTED:
             role = item.parameters.get("role")
             self._roles = {item.step_id: role} if isinstance(role, str) else {}
@@ -97,7 +97,7 @@ class Viewing:
         with suppress(IndexError):
             while True:
                 item = self._items.popleft()
-                if isinstance(item, Event) and item.kind == _RUN_START:
+                if isinstance(item, Event) and item.kind == RUN_START:
                     self._fresh.clear()
                     self._fresh.update(self.previews)
                 if isinstance(item, Batch | Event | StepMark):
@@ -203,6 +203,6 @@ class Viewing:
 
     def _warn(self, text: str) -> None:
         self.trouble = text
-        event = Event(self._clock.now_ns(), "warning", "preview", text)
+        event = PREVIEW.at(self._clock.now_ns(), text)
         with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._hub.publish, event)

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from drivers.devices.motion.stage import Axis
 from foundation.clock import Clock
 from foundation.errors import ConfigError
+from foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE, HOMED, RE_APPROACHED
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.readings import Quality
 from stand.interlock import Interlock, Motions
 
@@ -37,20 +37,17 @@ async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HO
     profile = axis.profile
     if not await axis.homed():
         await axis.home()
-        text = f"{axis.name} had lost its scale and was homed; captures since its last home are suspect"
-        hub.publish(Event(clock.now_ns(), "warning", "homed", text, {"axis": axis.name}))
+        hub.publish(HOMED.at(clock.now_ns(), axis=axis.name))
         return float("nan")
     if profile.home_from is not None:
         await axis.move_to(profile.home_from)
     residual = await axis.home()
     steps = residual / profile.unit_per_step
-    text = f"{axis.name}: home was at {residual:.5f} {profile.unit} ({steps:.2f} steps)"
     data = {"axis": axis.name, "residual": round(residual, 5), "unit": profile.unit, "steps": round(steps, 2)}
     if abs(steps) > limit_steps:
-        text += f", more than {limit_steps:g} steps; captures since its last good home are suspect"
-        hub.publish(Event(clock.now_ns(), "warning", "home_residual_large", text, data))
+        hub.publish(HOME_RESIDUAL_LARGE.at(clock.now_ns(), limit_steps=limit_steps, **data))
     else:
-        hub.publish(Event(clock.now_ns(), "info", "home_residual", text, data))
+        hub.publish(HOME_RESIDUAL.at(clock.now_ns(), **data))
     return residual
 
 
@@ -70,9 +67,8 @@ async def ready(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: H
                 continue
             reason = f"stands at {reading.value:.4f} {reading.unit}"
         await approach(axis, position)
-        text = f"{name}: {reason}; approached {position:g} {reading.unit} again"
-        data = {"axis": name, "position": position, "unit": reading.unit, "reason": reason}
-        hub.publish(Event(clock.now_ns(), "info", "re-approached", text, data))
+        again = RE_APPROACHED.at(clock.now_ns(), axis=name, position=position, unit=reading.unit, reason=reason)
+        hub.publish(again)
 
 
 class Table:

@@ -10,12 +10,13 @@ from types import MappingProxyType
 
 from experiments.words import doing_in_words, mark_in_words
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, CLOCK_STEP, RUN_BEGINS, TO_AMBIENT
 from foundation.items import Batch, Event, Item, Original, StepMark
 from foundation.readings import Frame, Quality
-from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
+from recording.format.utc_offsets import UtcOffsets, offsets_of
 from stand.estimating.eta import Eta
 from stand.estimating.run_estimate import Night
-from stand.imaging.equilibrium import LOST, REACHED
+from stand.gate import HELD, RELEASED
 from stand.watching.moment import AIR, CAMERA, SET_POINT, Moment, held_by
 from stand.watching.remedies import next_command
 
@@ -85,15 +86,15 @@ class Follow:
     def _event(self, event: Event) -> None:
         self.eta.event(event)
         self._utc = offsets_of([event]) if event.kind == CLOCK_STEP else self._utc
-        if name := event.data.get("session") if event.kind in ("run.start", "run.resume") else "":
+        if name := event.data.get("session") if event.kind in RUN_BEGINS else "":
             self._session = str(self._directory / str(name))
-        if event.kind == "to_ambient":
+        if event.kind == TO_AMBIENT:
             self._doing, self._soaks_since_ns = "back to the laboratory's temperature", None
-        if event.kind in (LOST, REACHED):
-            self._soaks_since_ns = event.time_ns if event.kind == LOST else None
-        if event.kind in ("held", "released"):
+        if event.kind in (CAMERA_EQUILIBRIUM_LOST, CAMERA_EQUILIBRIUM):
+            self._soaks_since_ns = event.time_ns if event.kind == CAMERA_EQUILIBRIUM_LOST else None
+        if event.kind in (HELD, RELEASED):
             reason = str(event.data.get("reason"))
-            (self._reasons.add if event.kind == "held" else self._reasons.discard)(reason)
+            (self._reasons.add if event.kind == HELD else self._reasons.discard)(reason)
             self._moment = replace(self._moment, held=held_by(sorted(self._reasons)))
             self._next_ns = event.time_ns
         if event.level != "info":

@@ -3,9 +3,10 @@ import pytest
 
 from foundation.clock import NS_PER_S
 from foundation.errors import SessionError
+from foundation.events import TRIMMED
 from foundation.items import StepMark, StepState
 from recording.exporting.replay import replay_and_record
-from recording.exporting.trim import TRIMMED, trim
+from recording.exporting.trim import trim
 from recording.format.layout import FRAMES
 from recording.reading.session import Session
 from tests.recording.recorded import INFO, MS, START_NS, frame, half_second, images, record, telemetry

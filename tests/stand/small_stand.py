@@ -10,12 +10,13 @@ from drivers.settings import EquilibriumSettings
 from experiments.steps import Capture
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
 from foundation.errors import StandTripped, Unreachable
+from foundation.events import CAMERA_EQUILIBRIUM_LOST
 from foundation.hub import Hub
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Frame, Reading
 from markers.target import Target
 from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
-from stand.imaging.equilibrium import LOST, CameraEquilibrium
+from stand.imaging.equilibrium import CameraEquilibrium
 from stand.interlock import Interlocked
 from stand.running.executing.camera_gap import OffsetWatch
 from stand.running.executing.deciding import Decider, fixed_plan
@@ -327,7 +328,7 @@ class Life:
             self._open_since_ns = self.clock.now_ns()
 
     def _on_item(self, item):
-        self.disturbances += isinstance(item, Event) and item.kind == LOST
+        self.disturbances += isinstance(item, Event) and item.kind == CAMERA_EQUILIBRIUM_LOST
         if isinstance(item, StepMark):
             self.begun += item.state is StepState.STARTED
         if isinstance(item, StepMark | Frame | Event):

@@ -1,8 +1,9 @@
 from foundation.clock import NS_PER_S, seconds_ns
+from foundation.events import CLOCK_STEP, HOST_SUSPENDED
 from foundation.hub import Hub
 from foundation.items import Event, Item
-from recording.format.utc_offsets import CLOCK_STEP, UtcOffsets, offsets_of
-from stand.running.opening.clock_watch import HOST_SUSPENDED, ClockWatch
+from recording.format.utc_offsets import UtcOffsets, offsets_of
+from stand.running.opening.clock_watch import ClockWatch
 from tests.host import Host
 
 

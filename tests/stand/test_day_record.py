@@ -11,11 +11,11 @@ import pytest
 
 from foundation.clock import NS_PER_S, WallClock
 from foundation.errors import SessionError
+from foundation.events import RUN_END
 from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.patience import Patience
 from foundation.readings import Reading
-from recording.reading.contents import RUN_END
 from recording.reading.notes import NOTES_NAME, add_tags
 from recording.reading.session import Session
 from recording.repair.verify import verify

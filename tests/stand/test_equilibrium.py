@@ -10,11 +10,12 @@ import pytest
 
 from drivers.settings import EquilibriumSettings
 from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from foundation.events import CAMERA_EQUILIBRIUM_LOST
 from foundation.hub import Hub
 from foundation.items import Batch, Event
 from foundation.readings import Reading, bad_reading
 from stand.imaging.camera_cooling import CameraTemperature
-from stand.imaging.equilibrium import LOST, CameraEquilibrium
+from stand.imaging.equilibrium import CameraEquilibrium
 from stand.running.executing.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
 from stand.running.executing.settling_watch import SettlingWatch
 
@@ -133,12 +134,12 @@ def test_a_camera_that_still_warms_up_is_no_offset_to_compare_with():
         publish(hub, "camera.temperature", time_s * NS_PER_S, 41.0 + 0.02 * (time_s - 900))
         publish(hub, "thermometers.air", time_s * NS_PER_S, 38.0)
     watch.settled(38.0)
-    hub.publish(Event(clock.now_ns(), "warning", LOST, "its supply was off", {}))
+    hub.publish(Event(clock.now_ns(), "warning", CAMERA_EQUILIBRIUM_LOST, "its supply was off", {}))
     for time_s in range(1001, 1200, 5):
         publish(hub, "camera.temperature", time_s * NS_PER_S, 55.0)
         publish(hub, "thermometers.air", time_s * NS_PER_S, 38.0)
     watch.settled(38.0)
-    assert [event.kind for event in events] == [LOST]
+    assert [event.kind for event in events] == [CAMERA_EQUILIBRIUM_LOST]
 
 
 def test_what_is_kept_of_a_camera_does_not_grow_with_the_hours():

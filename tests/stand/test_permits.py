@@ -312,7 +312,7 @@ async def test_a_board_that_drops_in_time_is_suited_and_its_time_is_measured_whe
         (found,) = bench.events
         assert (found.level, found.kind) == ("info", "dead_man_tested")
         held_s = found.data.get("held_s")
-        assert found.data == {"rearmed": True, "dropped": True, "pulse_s": TEST_S} | (
+        assert found.data == {"device": "relays", "rearmed": True, "dropped": True, "pulse_s": TEST_S} | (
             {"held_s": held_s} if is_timed else {}
         )
         if is_timed:

@@ -9,11 +9,11 @@ import pytest
 
 from foundation.clock import VirtualClock, WallClock
 from foundation.errors import SessionError
+from foundation.events import PLAN_CHANGED
 from foundation.hub import Hub
 from foundation.items import Event, StepMark, StepState
 from foundation.patience import Patience
 from recording.format.restarts import restarted
-from recording.reading.contents import PLAN_CHANGED
 from stand.fault import Fault
 from stand.gate import INTERLOCK, OPERATOR, STOPPING
 from stand.running.memory.entries import (

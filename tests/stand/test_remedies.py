@@ -1,16 +1,21 @@
 """Each kind of event is a row of one table, from which the rest follows, also one that somebody else adds."""
 
 import ast
+import inspect
+from collections.abc import Iterator
 from pathlib import Path
+from string import Formatter
 
 import pytest
 
 import stand
+from foundation import events
 from foundation.clock import NS_PER_S
 from foundation.events import GUARD, KINDS, Alert, EventKind, alert_of, event, guard_rule
 from foundation.hub import Hub
 from foundation.items import Event
 from foundation.repeats import RepeatLimit
+from stand import gate
 from stand.serving.alert_book import AlertBook
 from stand.watching.remedies import next_command, troubleshooting
 from stand.watching.there import event_line
@@ -102,3 +107,73 @@ def test_each_rule_that_trips_has_a_row():
         if isinstance(call, ast.Call) and ast.unparse(call.func) == "Fault" and call.args
     ]
     assert [ast.unparse(each) for each in named if isinstance(each, ast.Constant)] == []
+
+
+ROOMS = ("stand", "recording", "drivers/devices", "drivers/settings.py", "foundation", "experiments", "compensation")
+TREES = {
+    path: ast.parse(text)
+    for room in ROOMS
+    for path in ([ROOT / room] if room.endswith(".py") else sorted((ROOT / room).rglob("*.py")))
+    if "foundation.events" in (text := path.read_text("utf-8")) or "Event(" in text
+}
+NAMED = {name: row for name, row in vars(events).items() if isinstance(row, EventKind)} | {
+    "HELD": gate.HELD,
+    "RELEASED": gate.RELEASED,
+}
+
+
+def fields_of(row: EventKind) -> set[str]:
+    """What its text needs."""
+    if isinstance(row.text, str):
+        return {name.partition("[")[0] for _, name, _, _ in Formatter().parse(row.text) if name}
+    of = inspect.signature(row.text).parameters.values()
+    return {each.name for each in of if each.default is each.empty and each.kind is each.POSITIONAL_OR_KEYWORD}
+
+
+def sites() -> Iterator[tuple[EventKind, set[str], str]]:
+    """Each row that is published by its name, with the fields that it is given there; data that come as a whole are
+    not followed."""
+    for path, tree in TREES.items():
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+            match call:
+                case ast.Call(func=ast.Attribute(value=ast.Name(id=name), attr="at")) if name in NAMED:
+                    given = call.args[1:]
+                case ast.Call(func=ast.Attribute(attr="tell" | "_tell"), args=[ast.Name(id=name), *given]) if (
+                    name in NAMED
+                ):
+                    pass
+                case _:
+                    continue
+            if all(keyword.arg for keyword in call.keywords):
+                yield (
+                    NAMED[name],
+                    {str(keyword.arg) for keyword in call.keywords} | ({"said"} if given else set()),
+                    f"{path.name}:{call.lineno}",
+                )
+
+
+def test_each_site_gives_what_the_text_of_its_row_needs():
+    seen = list(sites())
+    assert [(row, where) for row, given, where in seen if not fields_of(row) - {"said"} <= given] == []
+    assert len({row for row, _, _ in seen}) > 70
+
+
+def test_no_other_place_makes_an_event():
+    made = {
+        str(path.relative_to(ROOT))
+        for path, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "Event" and node.args
+    }
+    assert made == {"foundation/events.py", "recording/format/messages.py"}  # the latter is one that was recorded
+
+
+def test_each_row_is_used():
+    elsewhere = {
+        name.id
+        for path, tree in TREES.items()
+        if path.name != "events.py"
+        for name in ast.walk(tree)
+        if isinstance(name, ast.Name)
+    }
+    assert sorted(name for name in set(NAMED) - elsewhere) == []

@@ -9,7 +9,7 @@ from foundation.clock import seconds_ns
 from foundation.hub import Hub
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Reading, bad_reading
-from recording.writing.notices import Notice, SpaceWatch
+from recording.writing.notices import SpaceWatch
 from stand.config.stand_config import load_config, packaged
 from stand.fault import Fault
 from stand.gate import OPERATOR
@@ -112,11 +112,10 @@ def test_a_capture_that_has_ended_excuses_nothing(end: StepState):
 
 def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_path: Path):
     """What the recorder's own watch says, at a limit that no disk keeps."""
-    notices: list[Notice] = []
+    notices: list[Event] = []
     SpaceWatch(tmp_path, 10**18, 0.0, lambda: 0, notices.append).check()
     table = Table()
-    notice = notices[0]
-    table.hub.publish(Event(0, notice.level, notice.kind, notice.text))
+    table.hub.publish(notices[0])
     found = table.first_s(4000)
     assert found is not None
     assert (found[0], found[1].rule, found[1].action) == (900, "disk_low", "hold")

@@ -326,14 +326,14 @@ def test_a_frame_is_settled_when_it_is_the_first_after_a_soak_and_no_warm_up():
 
 def test_soaks_are_credited_only_in_the_band_and_when_the_camera_was_on():
     state, set_up = fold(PLAN, STATES["half soaked"]), SetUp(30.0, (PLAN[3],))
-    for pv_degC, kind in ((29.1, "soak_credited"), (31.0, "soak_credited"), (28.9, "soak_restarted")):
+    for pv_degC, lost in ((29.1, ()), (31.0, ()), (28.9, (PLAN[3],))):
         worth = worth_of_soaks(state, set_up, Surroundings(0, pv_degC=pv_degC))
-        assert (worth.kind, worth.lost) == (kind, () if kind == "soak_credited" else (PLAN[3],))
+        assert (bool(worth.text), worth.lost) == (True, lost)
     assert worth_of_soaks(state, set_up, Surroundings(0, pv_degC=math.nan)).lost
     cold = after(state, Cooled(0))
     assert worth_of_soaks(cold, set_up, Surroundings(0, pv_degC=30.0)).lost
     assert not worth_of_soaks(cold, SetUp(30.0, (PLAN[3],), camera_on=False), Surroundings(0, pv_degC=30.0)).lost
-    assert worth_of_soaks(fold(PLAN, begun(SOAK)), set_up, Surroundings(0, pv_degC=20.0)).kind == ""
+    assert worth_of_soaks(fold(PLAN, begun(SOAK)), set_up, Surroundings(0, pv_degC=20.0)).text == ""
     assert not after(cold, Restored(0, 1)).is_cold
     assert after(after(cold, Cooled(0)), Restored(0, 1)).is_cold  # once more meanwhile
 

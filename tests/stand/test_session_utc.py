@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from foundation.clock import NS_PER_S
+from foundation.events import CLOCK_STEP
 from foundation.items import Event
-from recording.format.utc_offsets import CLOCK_STEP
 from recording.reading.session import Session
 from recording.repair.verify import verify
 from stand.commands.sessions.session_commands import app

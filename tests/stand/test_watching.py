@@ -13,15 +13,14 @@ from rich.live import Live
 from experiments.steps import Capture, Role, Soak, number_steps, parameters_of
 from experiments.words import doing_in_words
 from foundation.clock import NS_PER_S
+from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, SOAK_LONGER
 from foundation.items import Batch, Event, StepMark, StepState
 from foundation.readings import Reading, bad_reading
 from recording.format.utc_offsets import UtcOffsets
 from stand.commands.control_cli import idle_lines
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price
-from stand.estimating.eta import SOAK_LONGER
 from stand.estimating.run_estimate import Night
-from stand.imaging.equilibrium import LOST, REACHED
 from stand.serving.desk import HeatByHand, ReadingState, StandState
 from stand.watching.follow import Follow
 from stand.watching.live import Foot, Lines
@@ -99,11 +98,11 @@ def test_a_run_is_followed_from_its_first_step_on(follow: tuple[Follow, list[Mom
 def test_what_a_step_waits_for_is_said_with_it(follow: tuple[Follow, list[Moment], list[str]]):
     subscriber, moments, _ = follow
     subscriber(mark(0, 0, StepState.STARTED))
-    subscriber(Event(BEGIN_NS, "warning", LOST, "it was off"))
+    subscriber(Event(BEGIN_NS, "warning", CAMERA_EQUILIBRIUM_LOST, "it was off"))
     subscriber(Batch("all", BEGIN_NS + 120 * NS_PER_S, ()))
     again = doing_in_words("soak for 10 min", 120.0, goes_on=False)
     assert moments[-1].doing == again != "soak for 10 min"
-    subscriber(Event(BEGIN_NS + 300 * NS_PER_S, "info", REACHED, "it is at rest"))
+    subscriber(Event(BEGIN_NS + 300 * NS_PER_S, "info", CAMERA_EQUILIBRIUM, "it is at rest"))
     subscriber(Event(BEGIN_NS + 600 * NS_PER_S, "info", SOAK_LONGER, "", {"step_id": SOAK_ID, "by_s": 90.0}))
     subscriber(Batch("all", BEGIN_NS + 601 * NS_PER_S, ()))
     assert moments[-1].doing == doing_in_words("soak for 10 min", None, goes_on=True)

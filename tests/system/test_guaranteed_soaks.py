@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from compensation.observations import observe
+from foundation.events import SOAK_LONGER
 from foundation.hub import Hub
 from foundation.items import Event, Item, StepMark, StepState
 from foundation.readings import UNSETTLED
 from recording.reading.session import Session
-from stand.estimating.eta import SOAK_LONGER
 from stand.running.order import Order
 from stand.running.resume import interruption
 from stand.running.run import Interrupted, resume, run_virtual

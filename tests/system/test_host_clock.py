@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import StandError
+from foundation.events import CLOCK_STEP
 from foundation.hub import Hub
 from foundation.items import Item, StepMark
-from recording.format.utc_offsets import CLOCK_STEP
 from recording.reading.session import Session
 from stand.commands.sessions.session_commands import app
 from stand.config.stand_config import StandConfig

@@ -25,6 +25,7 @@ from foundation.calls import Lane
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.documents import Document
 from foundation.errors import Unreachable
+from foundation.events import CLOCK_SET_BACK, NO_PICTURE, PICTURE_LEFT_OUT, PICTURE_TAKEN, PICTURES_BACK, PICTURES_LOST
 from foundation.items import Event, Item, Original
 from foundation.readings import Quality, Reading, bad_reading
 
@@ -189,9 +190,9 @@ class ThermalImager:
     def _tell_folder(self, lost: str, now_ns: int) -> None:
         """An event when the folder is lost, or is there again."""
         if lost and not self._lost:
-            self._publish(self._event("warning", "pictures_lost", lost, {"reason": lost}, now_ns))
+            self._publish(PICTURES_LOST.at(now_ns, device=self.name, reason=lost))
         elif self._lost and not lost:
-            self._publish(self._event("info", "pictures_back", "its folder is there again", {}, now_ns))
+            self._publish(PICTURES_BACK.at(now_ns, device=self.name))
         self._lost = lost
 
     def _due(self, listed: dict[str, _Stamp], now_ns: int) -> list[str]:
@@ -211,7 +212,7 @@ class ThermalImager:
         is_stale = now_ns - self._latest_ns > seconds_ns(self._settings.stale_after_s)
         if is_stale and not self._is_stale:
             minutes = self._settings.stale_after_s / 60
-            self._publish(self._event("warning", "no_picture", f"no picture for {minutes:g} min", {"minutes": minutes}))
+            self._publish(NO_PICTURE.at(self._clock.now_ns(), device=self.name, minutes=minutes))
         self._is_stale = is_stale
 
     # Below: in the lane's thread.
@@ -255,8 +256,7 @@ class ThermalImager:
             return []  # not readable now; it is asked again
         except NotRadiometric as error:
             seen.settled = True  # until it changes
-            text = f"{name} is left out: {error}"
-            return [self._event("warning", "picture_left_out", text, {"file": name, "reason": str(error)}, now_ns)]
+            return [PICTURE_LEFT_OUT.at(now_ns, device=self.name, file=name, reason=str(error))]
         self._hashes[digest] = name
         while len(self._hashes) > _KNOWN_HASHES:
             del self._hashes[next(iter(self._hashes))]
@@ -284,8 +284,7 @@ class ThermalImager:
         if first_ns - self._late[0] <= seconds_ns(apart_s):
             return []
         by_s, self._offset_s, self._late = round(lag_s - self._offset_s), min(lag_s, self._late[1]), None
-        text = f"its clock was set back by {by_s} s, and its pictures are dated accordingly from now on"
-        return [self._event("warning", "clock_set_back", text, {"by_s": by_s}, now_ns)]
+        return [CLOCK_SET_BACK.at(now_ns, device=self.name, by_s=by_s)]
 
     def _credit(self, name: str, digest: str, image: RadiometricImage, first_ns: int, now_ns: int) -> Event:
         """Keep its readings, and say what they were made of."""
@@ -300,6 +299,7 @@ class ThermalImager:
         around = image.around
         plain = temperatures_degC(image.counts, image.planck, around, image.emissivity)
         data: dict[str, object] = {
+            "device": self.name,
             "file": name,
             "sha256": digest,
             "model": image.model,
@@ -317,7 +317,7 @@ class ThermalImager:
         }
         if np.isfinite(plain).any():
             data |= {"lowest_degC": float(np.nanmin(plain)), "highest_degC": float(np.nanmax(plain))}
-        return self._event("info", "picture_taken", f"{name} of {image.model} {image.serial_number}", data, now_ns)
+        return PICTURE_TAKEN.at(now_ns, **data)
 
     def _spots(self, image: RadiometricImage, time_ns: int) -> Iterator[Reading]:
         height, width = image.counts.shape
@@ -337,7 +337,3 @@ class ThermalImager:
         if math.isinf(self._offset_s):
             return bad_reading(channel, "s", time_ns, "its pictures have no time")
         return Reading(channel, self._offset_s, "s", time_ns)
-
-    def _event(self, level: str, kind: str, text: str, data: dict[str, object], now_ns: int | None = None) -> Event:
-        time_ns = self._clock.now_ns() if now_ns is None else now_ns
-        return Event(time_ns, level, kind, f"{self.name}: {text}", {"device": self.name, **data})

@@ -24,7 +24,8 @@ from drivers.devices.regulators.relay_tuning import Found, Tuning, TuningSetting
 from drivers.settings import DeviceName, Identity, Polled
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceError, DeviceFault, Occupied, Refused
-from foundation.items import Event, Item
+from foundation.events import AUTOTUNED
+from foundation.items import Item
 from foundation.readings import Quality, Reading, bad_reading
 from foundation.tasks import cancelled, failure_text
 
@@ -169,9 +170,8 @@ class SoftwareRegulator:
             pv, _ = self._pv(self._clock.now_ns())
             self._state = None if pv is None else pid.start(self._settings.law, pv.value, output_percent)
         law = relay_tuning.tuned(self._settings.law, point)
-        data: dict[str, object] = {"set_point_degC": sp_degC, **asdict(point), "law": law.model_dump(mode="json")}
-        text = f"{self.name} is tuned at {sp_degC:g} degC; in the stand's file: {relay_tuning.as_yaml(law)}"
-        self._publish(Event(self._clock.now_ns(), "info", "autotuned", text, data))
+        data = {"device": self.name, "set_point_degC": sp_degC, **asdict(point), "law": law.model_dump(mode="json")}
+        self._publish(AUTOTUNED.at(self._clock.now_ns(), relay_tuning.as_yaml(law), **data))
         return law
 
     async def _rested(self) -> None:

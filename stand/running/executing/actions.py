@@ -278,10 +278,9 @@ def _last_switch(steps: Plan, *, on: bool) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """What the soaks that were begun are worth after a disturbance; `lost` are soaked again. kind: of the event that
-    says so, "" when there was nothing to lose; text: of it."""
+    """What the soaks that were begun are worth after a disturbance; `lost` are soaked again. text: why, "" when
+    there was nothing to lose."""
 
-    kind: str = ""
     text: str = ""
     lost: Plan = ()
 
@@ -293,8 +292,8 @@ def worth_of_soaks(state: RunState, set_up: SetUp, around: Surroundings) -> Wort
     if not begun or set_up.chamber_degC is None:
         return Worth()
     if state.is_cold and set_up.camera_on:
-        return Worth("soak_restarted", "the camera was or may have been off; the soak is restarted", begun)
+        return Worth("the camera was or may have been off", begun)
     text = f"the chamber is at {around.pv_degC:.2f} degC, {{}}within {CREDITED_WITHIN_K:g} K of its set-point"
     if abs(around.pv_degC - set_up.chamber_degC) <= CREDITED_WITHIN_K:
-        return Worth("soak_credited", text.format(""))
-    return Worth("soak_restarted", text.format("not ") + "; the soak is restarted", begun)
+        return Worth(text.format(""))
+    return Worth(text.format("not "), begun)

@@ -17,15 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foundation.clock import NS_PER_S, Clock, seconds_ns
+from foundation.events import (
+    CAMERA_EQUILIBRIUM,
+    CAMERA_EQUILIBRIUM_LOST,
+    CAMERA_OFFSET_CHANGED,
+    CAMERA_OFFSET_SAME,
+    RUN_BEGINS,
+)
 from foundation.hub import Hub
 from foundation.items import Batch, Event, Item, StepState
 from foundation.readings import Quality, Reading
 from recording.reading.session import Session
 from stand.imaging.camera_cooling import CameraTemperature
-from stand.imaging.equilibrium import CAMERA, LOST, REACHED
+from stand.imaging.equilibrium import CAMERA
 
 AIR = "thermometers.air"
-CHANGED, SAME = "camera_offset_changed", "camera_offset_same"  # kinds of events
 LIMIT_K = 1.0
 _WINDOW_S = 120.0
 _STEADY_K = 0.2
@@ -79,25 +85,21 @@ class OffsetWatch:
         return float(np.mean(camera) - np.mean(air)) if _is_steady(camera) and air else math.nan
 
     def _tell(self, gap: OffsetGap, before_degC: float, before_K: float, after_degC: float, after_K: float) -> None:
-        data: dict[str, object] = {
-            "before_K": before_K,
-            "after_K": after_K,
-            "before_degC": before_degC,
-            "after_degC": after_degC,
-            "gap_ns": gap.from_ns,
-            "gap_end_ns": gap.to_ns,
-        }
-        text = (
-            f"camera minus air was {before_K:.2f} K at {before_degC:g} degC before the gap, "
-            f"and is {after_K:.2f} K at {after_degC:g} degC after it"
+        kind = CAMERA_OFFSET_CHANGED if abs(after_K - before_K) > LIMIT_K else CAMERA_OFFSET_SAME
+        event = kind.at(
+            self._clock.now_ns(),
+            before_K=before_K,
+            after_K=after_K,
+            before_degC=before_degC,
+            after_degC=after_degC,
+            gap_ns=gap.from_ns,
+            gap_end_ns=gap.to_ns,
         )
-        changed = abs(after_K - before_K) > LIMIT_K
-        level, kind = ("warning", CHANGED) if changed else ("info", SAME)
-        self._hub.publish(Event(self._clock.now_ns(), level, kind, text, data))
+        self._hub.publish(event)
 
     def _receive(self, item: Item) -> None:
         """The hub's subscriber."""
-        if isinstance(item, Event) and item.kind == LOST and self._gap is None:
+        if isinstance(item, Event) and item.kind == CAMERA_EQUILIBRIUM_LOST and self._gap is None:
             self._gap = OffsetGap(self._settled_K, item.time_ns, item.time_ns)
         if isinstance(item, Batch):
             for reading in item.readings:
@@ -166,14 +168,16 @@ def doubt(before: CameraBefore, boot_id: str | None, was_supplied: bool | None, 
 def camera_before(session: Session) -> CameraBefore:
     """By what is recorded."""
     boot_id = lost = ""
-    events = [event for event in session.events() if event.kind in (LOST, REACHED, "run.start", "run.resume")]
+    events = [
+        event for event in session.events() if event.kind in (CAMERA_EQUILIBRIUM_LOST, CAMERA_EQUILIBRIUM, *RUN_BEGINS)
+    ]
     lost_ns = -1
     for event in events:
         named = event.data.get("boot_id")
         boot_id = named if isinstance(named, str) else boot_id
-        if event.kind == LOST:
+        if event.kind == CAMERA_EQUILIBRIUM_LOST:
             lost, lost_ns = "its equilibrium had been lost before", event.time_ns
-        elif event.kind == REACHED:
+        elif event.kind == CAMERA_EQUILIBRIUM:
             lost = ""
     if any(mark.kind == "PowerCamera" and mark.time_ns > lost_ns for mark in session.steps()):
         lost = ""  # by the plan, which soaks it as it needs it

@@ -36,12 +36,12 @@ from experiments.steps import (
 from experiments.steps import Step as PlanStep
 from foundation.clock import NS_PER_S, Clock
 from foundation.errors import ConfigError, DeviceError, Superseded
+from foundation.events import PLAN_CHANGED, STEP_BROKEN_OFF, UNDECIDED, WARM_UP_GAP
 from foundation.hub import Hub
 from foundation.items import StepMark, StepState
 from foundation.readings import UNSETTLED
 from foundation.tasks import cancelled, first_of
 from recording.format.restarts import restarted
-from recording.reading.contents import PLAN_CHANGED
 from stand.interlock import Interlocked
 from stand.running.executing.actions import (
     Action,
@@ -75,7 +75,6 @@ from stand.running.memory.entries import (
     Change,
     Cooled,
     Due,
-    Edited,
     Extended,
     Readying,
     Skipped,
@@ -167,8 +166,7 @@ class Executor:
         self._allowed(changed.plan)
         if isinstance(change, Skipped) and (planned := self._state.step(change.step_id)):
             self._mark(planned, StepState.SKIPPED)
-        level = "info" if isinstance(change, Edited) and change.decided else "warning"
-        self._log.tell(level, PLAN_CHANGED, change_text(self._state, change), {**data_of(change), **changed.size})
+        self._log.tell(PLAN_CHANGED, change_text(self._state, change), **{**data_of(change), **changed.size})
         self._changed.set()
         self._changed = asyncio.Event()
         await self._log.write(change)
@@ -222,8 +220,7 @@ class Executor:
                     raise
             planned = self._state.step(self._state.under_way)
             if planned is not None and not is_readying:
-                text = f"{kind_of(planned.step)} was broken off by an interlock ({error})"
-                self._log.tell("warning", "step_broken_off", text)
+                self._log.tell(STEP_BROKEN_OFF, str(error), step=kind_of(planned.step))
                 self._log.enter(Due(self._clock.now_ns(), None))
             return False
         return True
@@ -326,10 +323,10 @@ class Executor:
             return
         decided = await self._decider(step)
         if isinstance(decided.answer, Undecided):
-            self._log.tell("warning", "undecided", f"{decided.reason}; the fixed plan goes on")
+            self._log.tell(UNDECIDED, f"{decided.reason}; the fixed plan goes on")
         change = change_of_plan(self._state, planned, decided, self._clock.now_ns())
         if change is None:
-            self._log.tell("warning", "undecided", "an operator has changed the plan; nothing more is decided about it")
+            self._log.tell(UNDECIDED, "an operator has changed the plan; nothing more is decided about it")
         else:
             await self._change(change)
 
@@ -346,8 +343,7 @@ class Executor:
         if self._state.was_held and capture.role is Role.WARM_UP:
             # A camera continues to warm up while the run is held: what was not seen of it is reported.
             missing_s = (self._clock.now_ns() - self._state.seen_ns) / NS_PER_S
-            text = f"the run was held: the camera has warmed up for {missing_s:.1f} s without a frame"
-            self._log.tell("warning", "warm_up_gap", text)
+            self._log.tell(WARM_UP_GAP, missing_s=missing_s)
         flags = (UNSETTLED,) if self._state.is_unsettled and capture.role is not Role.WARM_UP else ()
         imaging = self._stand.imaging
         is_taken = await imaging.take_frame(capture.exposure_s, step_id, frame.due_ns, capture.cameras, flags)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from foundation.clock import Clock
+from foundation.events import RESTORED, SOAK_CREDITED, SOAK_RESTARTED
 from stand.running.executing.actions import Surroundings, worth_of_soaks
 from stand.running.memory.entries import Dwell, Restored
 from stand.running.memory.journal import Logbook
@@ -32,8 +33,8 @@ async def restore(
         worth, now_ns = worth_of_soaks(log.state, set_up, surroundings()), clock.now_ns()
         if worth.lost:
             await log.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in worth.lost))
-        if worth.kind:
-            log.tell("warning" if worth.lost else "info", worth.kind, worth.text)
+        if worth.text:
+            log.tell(SOAK_RESTARTED if worth.lost else SOAK_CREDITED, worth.text)
         await stand.chamber.start(set_up.chamber_degC)
     log.enter(Restored(clock.now_ns(), disturbances))
-    log.tell("info", "restored", set_up.text)
+    log.tell(RESTORED, set_up.text)

@@ -13,8 +13,9 @@ import numpy as np
 from experiments.steps import PlannedStep, SoakUntilSettled
 from foundation.calls import Lane
 from foundation.clock import Clock, seconds_ns
+from foundation.events import NOT_SETTLED, SETTLED
 from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
+from foundation.items import Batch, Item
 from foundation.readings import Frame, Reading
 from markers.target import Target
 from stand.estimating.chamber_model import BAND_K
@@ -85,14 +86,13 @@ class SettlingWatch:
         if await self._looked(soak, step_id) and soaked_s >= soak.min_s:
             verdict = judge(self._seen(), soak, seconds(self._clock.now_ns()))
             if verdict.settled:
-                self._tell("info", "settled", f"settled after {soaked_s / 60:.0f} min: {verdict.rates}")
+                self._hub.publish(SETTLED.at(self._clock.now_ns(), verdict.rates, soaked_s=soaked_s))
                 return True
         if soaked_s >= soak.max_s:
             verdict = judge(self._seen(), soak, seconds(self._clock.now_ns()))
             why = verdict.missing or "the last look came too late"
             seen = f" ({self._unseen})" if self._unseen else ""
-            text = f"not settled after {soaked_s / 60:.0f} min: {why}{seen}"
-            self._tell("warning", "not_settled", text)
+            self._hub.publish(NOT_SETTLED.at(self._clock.now_ns(), f"{why}{seen}", soaked_s=soaked_s))
         return False
 
     async def _looked(self, soak: SoakUntilSettled, step_id: str) -> bool:
@@ -141,9 +141,6 @@ class SettlingWatch:
                     kept.extend((seconds(reading.time_ns), math.nan if is_doubted else reading.value))
                     if len(kept) > 4 * _KEPT:
                         del kept[: 2 * _KEPT]
-
-    def _tell(self, level: str, kind: str, text: str) -> None:
-        self._hub.publish(Event(self._clock.now_ns(), level, kind, text))
 
     def _has_arrived(self, chamber_degC: float) -> bool:
         chamber = self._readings[CHAMBER]

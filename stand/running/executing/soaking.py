@@ -8,8 +8,8 @@ from collections.abc import Callable
 from experiments.steps import AnySoak, PlannedStep, Soak, band_K_of, last_part_s
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceFault
+from foundation.events import SOAK_LONGER, SOAK_UNSETTLED
 from foundation.tasks import first_of
-from stand.estimating.eta import SOAK_LONGER
 from stand.gate import Gate
 from stand.running.executing.settling_watch import SettlingWatch
 from stand.running.memory.entries import Dwell
@@ -62,8 +62,7 @@ class Soaking:
             if isinstance(step, Soak) and step.unsettled == "hold":
                 await self._log.write(Dwell(now_ns, step_id, 0.0))
                 raise DeviceFault("regulator", f"{text}; once cleared, it begins anew")
-            text = f"{text}; the frames after it are marked as unsettled"
-            self._log.tell("warning", "soak_unsettled", text, {"step_id": step_id})
+            self._log.tell(SOAK_UNSETTLED, text, step_id=step_id)
         ended = "" if not is_over else "settled" if is_settled else "unsettled"
         await self._log.write(Dwell(now_ns, step_id, earned_ns / NS_PER_S, ended))
 
@@ -99,8 +98,7 @@ class Soaking:
     def _tell_longer(self, step: Soak, soak: PlannedStep, soaked_s: float) -> float:
         """That it goes on beyond its time; returned is for how long at least, s."""
         by_s = min(self._missing_s(step), duration_of(soak) / NS_PER_S - soaked_s)
-        text = f"{self._text(step)}; the soak goes on, for {by_s:.0f} s at least"
-        self._log.tell("info", SOAK_LONGER, text, {"step_id": soak.step_id, "by_s": by_s})
+        self._log.tell(SOAK_LONGER, self._text(step), step_id=soak.step_id, by_s=by_s)
         return by_s
 
     def _text(self, step: AnySoak) -> str:

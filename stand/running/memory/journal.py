@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import os
 from asyncio import Task, create_task, gather
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -19,9 +19,9 @@ from pathlib import Path
 from foundation.calls import Lane, Line
 from foundation.clock import Clock
 from foundation.errors import NotThere, SessionError
+from foundation.events import JOURNAL_NOT_SAVED, EventKind
 from foundation.files import replace_file, sync_folder
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.patience import Patience
 from recording.format.layout import TELEMETRY
 from recording.reading.journal_lines import (
@@ -36,7 +36,7 @@ from recording.writing.disk import JOURNAL_LINE, Disk
 from recording.writing.home import FolderLost
 from recording.writing.locks import lock
 from stand.fault import Fault
-from stand.gate import IN_WORDS, INTERLOCK, STOPPING
+from stand.gate import HELD, IN_WORDS, INTERLOCK, RELEASED, STOPPING
 from stand.running.memory.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encoded
 from stand.running.memory.fold import after
 from stand.running.memory.state import RunState
@@ -334,7 +334,7 @@ class Logbook:
     async def begin(self, journal: Journal, *entries: Written, disk: Disk | None = None) -> None:
         """The journal's first entries of this run, on the disk when this returns; `disk` writes it."""
         self._journal = journal
-        journal.start(self._clock, lambda text: self.tell("error", "journal_not_saved", text), disk)
+        journal.start(self._clock, lambda text: self.tell(JOURNAL_NOT_SAVED, text), disk)
         await self.write(*entries)
 
     async def end(self, ended: Ended, patience: Patience) -> None:
@@ -368,9 +368,9 @@ class Logbook:
         if self._journal is not None:
             await self._journal.write(*entries)
 
-    def tell(self, level: str, kind: str, text: str, data: Mapping[str, object] | None = None) -> None:
+    def tell(self, kind: EventKind, said: str = "", /, **data: object) -> None:
         """An event, now."""
-        self._hub.publish(Event(self._clock.now_ns(), level, kind, text, data or {}))
+        self._hub.publish(kind.at(self._clock.now_ns(), said, **data))
 
     def tripped(self, fault: Fault) -> None:
         """The guard makes the stand safe; it publishes that itself."""
@@ -380,11 +380,7 @@ class Logbook:
         """A listener of the gate; the end of a run is published separately."""
         if reason == STOPPING:
             return
-        cause = IN_WORDS.get(reason, reason)
-        if held:
-            self.tell("warning", "held", f"held by {cause}", {"reason": reason})
-        else:
-            self.tell("info", "released", f"no longer held by {cause}", {"reason": reason})
+        self.tell(HELD if held else RELEASED, IN_WORDS.get(reason, reason), reason=reason)
         now_ns = self._clock.now_ns()
         if reason == INTERLOCK and not held:
             self._note(Cleared(now_ns))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from foundation.clock import NS_PER_S, PIECE_S, WallClock, seconds_ns
+from foundation.events import HOST_SUSPENDED
 from foundation.hub import Hub
 from foundation.instants import duration
-from foundation.items import Event
-from recording.format.utc_offsets import CLOCK_STEP, REPEATED_NS, offset_event
+from recording.format.utc_offsets import REPEATED_NS, offset_event, step_event
 
-HOST_SUSPENDED = "host_suspended"  # kind of the event with the length of a suspend
 _PERIOD_S = PIECE_S
 _LIMIT_NS = seconds_ns(1.0)
 
@@ -52,22 +51,10 @@ class ClockWatch:
         self._seen_ns = now_ns
 
     def _tell_suspend(self, now_ns: int, length_ns: int) -> None:
-        text = f"the host was suspended for {duration(length_ns)}: nothing was watched or recorded meanwhile"
         data = {"length_s": length_ns / NS_PER_S, "seen_ns": self._seen_ns, "stand_ns": now_ns}
-        self._hub.publish(Event(now_ns, "warning", HOST_SUSPENDED, text, data))
+        self._hub.publish(HOST_SUSPENDED.at(now_ns, duration(length_ns), **data))
 
     def _tell_step(self, now_ns: int, offset_ns: int) -> None:
-        by_s, utc_s = (offset_ns - self._recorded_ns) / NS_PER_S, offset_ns / NS_PER_S
-        text = (
-            f"the system clock moved {by_s:+.3f} s against the stand's clock, which is not changed; UTC is now "
-            f"{utc_s:+.3f} s from recorded instants"
-        )
-        data = {
-            "offset_before_ns": self._recorded_ns,
-            "offset_after_ns": offset_ns,
-            "seen_ns": self._seen_ns,
-            "stand_ns": now_ns,
-            "utc_ns": now_ns + offset_ns,
-        }
+        stepped = step_event(now_ns, self._recorded_ns, offset_ns, self._seen_ns)
         self._recorded_ns, self._reported_ns = offset_ns, now_ns
-        self._hub.publish(Event(now_ns, "warning", CLOCK_STEP, text, data))
+        self._hub.publish(stepped)

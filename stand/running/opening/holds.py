@@ -10,12 +10,12 @@ from collections.abc import Callable
 
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError, NotCleared, StandError
+from foundation.events import COMMAND, FLAP_NOT_SHUT, FLAP_SHUT_IN_HOLD
 from foundation.hub import Hub
 from foundation.items import Event, Item
 from foundation.tasks import first_of
 from stand.fault import Fault
 from stand.gate import STOPPING, Gate
-from stand.serving.command_event import COMMAND
 from stand.stand import Stand
 
 # Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.
@@ -42,15 +42,12 @@ async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
 async def _shut(stand: Stand, hub: Hub, clock: Clock) -> bool:
     """Whether it is shut now."""
     reasons = sorted(stand.gate.reasons)
-    data = {"reasons": reasons}
     try:
         await stand.imaging.close_flap()
     except DeviceError as error:
-        text = f"the flap does not close, although the run is held ({', '.join(reasons)}): {error}"
-        hub.publish(Event(clock.now_ns(), "error", "flap_not_shut", text, data))
+        hub.publish(FLAP_NOT_SHUT.at(clock.now_ns(), str(error), reasons=reasons))
         return False
-    text = f"the flap was shut: the run is held ({', '.join(reasons)})"
-    hub.publish(Event(clock.now_ns(), "info", "flap_shut_in_hold", text, data))
+    hub.publish(FLAP_SHUT_IN_HOLD.at(clock.now_ns(), reasons=reasons))
     return True
 
 

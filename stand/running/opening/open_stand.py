@@ -13,8 +13,8 @@ from typing import Protocol, TypeVar
 
 from foundation.clock import VirtualClock, WallClock
 from foundation.errors import DeviceFault, StandError, Unreachable
+from foundation.events import LATCH_NOT_CLEARED, LATCH_NOT_KEPT
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.patience import Patience
 from foundation.repeats import RepeatLimit
 from foundation.tasks import cancelled, watched
@@ -223,11 +223,7 @@ class OpenStand:
     def _keep(self, fault: Fault) -> None:
         """On the disk, before anything is said of it."""
         if self.kept is not None and (failure := self.kept.keep(fault, self.assembly.clock.now_ns())):
-            text = f"that the stand has tripped may be forgotten at a restart: {failure}"
-            self._tell("error", "latch_not_kept", text)
-
-    def _tell(self, level: str, kind: str, text: str) -> None:
-        self.assembly.hub.publish(Event(self.assembly.clock.now_ns(), level, kind, text))
+            self.assembly.hub.publish(LATCH_NOT_KEPT.at(self.assembly.clock.now_ns(), failure))
 
     def _trip(self, fault: Fault) -> None:
         self.fault_ns = self.assembly.clock.now_ns()
@@ -254,7 +250,7 @@ class OpenStand:
             if self.recorder is not None:
                 self.recorder.refound()
             if self.kept is not None and (failure := self.kept.forget()):
-                self._tell("warning", "latch_not_cleared", f"at a restart the stand is taken for tripped: {failure}")
+                self.assembly.hub.publish(LATCH_NOT_CLEARED.at(self.assembly.clock.now_ns(), failure))
             self.guard.clear()
 
 

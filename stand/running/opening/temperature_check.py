@@ -5,8 +5,8 @@ from __future__ import annotations
 from drivers.devices.protocols import Camera
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import Refused
+from foundation.events import NO_CAMERA_TEMPERATURE
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.readings import Quality
 
 _TRIES, _PAUSE_S = 3, 1.0
@@ -18,8 +18,7 @@ async def check_temperature(camera: Camera, hub: Hub, clock: Clock) -> None:
     Refused, with the feature and what the camera offers, when three readings in a row are BAD.
     """
     if not camera.settings.has_temperature:
-        text = "the camera is configured to have no temperature: no drift over it can be fitted to this session"
-        hub.publish(Event(clock.now_ns(), "warning", "no_camera_temperature", text))
+        hub.publish(NO_CAMERA_TEMPERATURE.at(clock.now_ns()))
         return
     (reading,) = await camera.read()
     for _ in range(_TRIES - 1):

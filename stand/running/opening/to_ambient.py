@@ -11,8 +11,8 @@ from contextlib import suppress
 
 from foundation.clock import Clock, seconds_ns
 from foundation.errors import DeviceError
+from foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, TO_AMBIENT
 from foundation.hub import Hub
-from foundation.items import Event
 from stand.config.stand_config import StandConfig
 from stand.fault import value_of
 from stand.gate import INTERLOCK
@@ -32,8 +32,7 @@ async def to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandConfig) 
     if not config.ending.to_ambient or not lacks:
         return
     set_point_degC = _ambient_degC(hub, config)
-    text = f"the plan is done; back to {set_point_degC:.1f} degC: {lacks}"
-    hub.publish(Event(clock.now_ns(), "info", "to_ambient", text, {"ambient_degC": set_point_degC}))
+    hub.publish(TO_AMBIENT.at(clock.now_ns(), lacks, ambient_degC=set_point_degC))
     until_ns, running_degC = clock.now_ns() + seconds_ns(config.ending.max_s), math.nan
 
     def held(reason: str, _: bool) -> None:
@@ -54,10 +53,9 @@ async def to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandConfig) 
                 wait_s = _AGAIN_S
         await clock.sleep_until(clock.now_ns() + seconds_ns(wait_s))
     if lacks:
-        text = f"after {config.ending.max_s / 60:.0f} min {lacks}; open the chamber with care"
-        hub.publish(Event(clock.now_ns(), "warning", "not_at_ambient", text))
+        hub.publish(NOT_AT_AMBIENT.at(clock.now_ns(), lacks, after_s=config.ending.max_s))
     else:
-        hub.publish(Event(clock.now_ns(), "info", "at_ambient", "the chamber is at the laboratory's temperature"))
+        hub.publish(AT_AMBIENT.at(clock.now_ns()))
     with suppress(DeviceError):  # the plan is done: what follows makes everything safe until it confirms
         await stand.chamber.stop()
 

@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from foundation.clock import Clock, WallClock, utc_offset_ns
+from foundation.events import COMMAND
 from foundation.hub import Hub
 from foundation.items import Event, Item, Original, StepMark
 from foundation.readings import Frame
 from foundation.tasks import failure_text
-from stand.serving.command_event import COMMAND
 from stand.serving.desk import Desk, Done, PlanStep, StandState, Who, WrittenStep
 from stand.serving.plan_faults import PlanCheck
 

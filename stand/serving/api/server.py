@@ -17,8 +17,8 @@ from typing import Any
 
 from foundation.clock import Clock
 from foundation.errors import ConfigError, SessionError, StandError
+from foundation.events import INTERFACE_FAILED, NO_CONTROL, EventKind
 from foundation.hub import Hub
-from foundation.items import Event
 from foundation.patience import Patience
 from foundation.tasks import failure_text
 from stand.serving.api.access import Access
@@ -59,7 +59,7 @@ async def serve(
         doors.update(_tcp_doors(interface))
         bridge = Bridge(desk, hub, clock)
         access = Access(interface.tokens, interface.hosts, interface.trusts_loopback)
-        stop = StopThread(bridge.stopping, access, lambda error: report("interface_failed", _failure(error)))
+        stop = StopThread(bridge.stopping, access, lambda error: report(INTERFACE_FAILED, _failure(error)))
     except BaseException:
         for door in doors.values():
             door.close()
@@ -134,15 +134,15 @@ def _tcp(option: str, host: str, port: int) -> socket.socket:
         raise ConfigError(f"{option} {port}: cannot listen at {host} ({error.strerror or error})") from error
 
 
-def _reporter(hub: Hub, clock: Clock) -> Callable[[str, str], None]:
+def _reporter(hub: Hub, clock: Clock) -> Callable[[EventKind, str], None]:
     """A function for any thread: a warning of this kind, once for each text."""
     loop, reported = asyncio.get_running_loop(), set[str]()
 
-    def report(kind: str, text: str) -> None:
+    def report(kind: EventKind, text: str) -> None:
         if text not in reported and len(reported) < 100:
             reported.add(text)
             with suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(lambda: hub.publish(Event(clock.now_ns(), "warning", kind, text)))
+                loop.call_soon_threadsafe(lambda: hub.publish(kind.at(clock.now_ns(), text)))
 
     return report
 
@@ -156,7 +156,7 @@ class _Thread:
         interface: Interface,
         access: Access,
         stop: StopThread,
-        report: Callable[[str, str], None],
+        report: Callable[[EventKind, str], None],
     ) -> None:
         self._bridge = bridge
         self._doors = doors
@@ -187,7 +187,7 @@ class _Thread:
         try:
             asyncio.run(self._main())
         except Exception as error:  # noqa: BLE001 - the run goes on without it
-            self._report("no_control", f"the run cannot be queried or paused: {failure_text(error)}")
+            self._report(NO_CONTROL, f"the run cannot be queried or paused: {failure_text(error)}")
         finally:
             self.is_ready.set()
             for door, listening in self._doors.items():
@@ -224,7 +224,7 @@ class _Thread:
         try:
             await door.serve(self._doors[door.option], self._bridge, pace, self._failed)
         except Exception as error:  # noqa: BLE001 - the other doors stay open
-            self._report("no_control", f"what {door.option} asked for is not served: {failure_text(error)}")
+            self._report(NO_CONTROL, f"what {door.option} asked for is not served: {failure_text(error)}")
 
     async def _look_after(self, listening: Any) -> None:
         """A logout removes $XDG_RUNTIME_DIR with the sockets that are in it."""
@@ -242,7 +242,7 @@ class _Thread:
                     self._stop.listen("stop", self._doors["stop"])
 
     def _failed(self, error: Exception) -> None:
-        self._report("interface_failed", _failure(error))
+        self._report(INTERFACE_FAILED, _failure(error))
 
 
 def _failure(error: Exception) -> str:
