@@ -28,13 +28,13 @@ from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import StandTripped
 from foundation.items import StepMark, StepState
 from foundation.readings import Frame
+from recording.reading.journal_lines import lines_of
 from stand.fault import Fault
 from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from stand.running.executing.actions import CREDITED_WITHIN_K
-from stand.running.memory.entries import Again, Dwell, Step
+from stand.running.memory.entries import Again, Dwell, Step, decoded
 from stand.running.memory.journal import JOURNAL_NAME
 from stand.running.opening.stop import Interrupted
-from tests.journals import read_lines
 from tests.stand.small_stand import Life
 
 FRAMES = 4
@@ -107,8 +107,9 @@ class RunMachine(RuleBasedStateMachine):
         data = (Path(self.folder.name) / JOURNAL_NAME).read_bytes()
         if not data.startswith(self.read):
             self.read, self.entries = b"", []
-        entries, size_bytes = read_lines(data[len(self.read) :])
-        self.read, self.entries = data[: len(self.read) + size_bytes], self.entries + entries
+        lines = lines_of(data)
+        self.read = data[: lines.size_bytes]
+        self.entries = [*self.entries, *map(decoded, lines.sound[len(self.entries) :])]
         return self.entries
 
     def _frames_that_count(self):
