@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from experiments.parameters import Known
-from experiments.steps import Capture, CloseFlap, Decide, OpenFlap, Role, SetTemperature, Soak, Step, estimate_s
+from experiments.steps import Capture, CloseFlap, Decide, OpenFlap, Role, SetTemperature, Soak, Step, usual_s
 
 MOST_VISITS = 200
 _VALIDATED_AFTER = 3
@@ -70,7 +70,7 @@ def first_decision(
         interval_s=frames.interval_s,
         exposure_s=frames.exposure_s,
     )
-    return replace(decide, left_s=_duration_s(fixed_visits(decide)))
+    return replace(decide, left_s=usual_s(fixed_visits(decide)))
 
 
 def fixed_visits(decide: Decide) -> tuple[Step, ...]:
@@ -99,12 +99,12 @@ def after_decision(decide: Decide, answer: Answer) -> tuple[Step, ...]:
 
 def _continued(decide: Decide, steps: tuple[Step, ...]) -> tuple[Step, ...]:
     """These steps, then the next decision and the fixed visits for which there is time behind them."""
-    left_s = max(0.0, decide.left_s - _duration_s(steps))
+    left_s = max(0.0, decide.left_s - usual_s(steps))
     validations = _validations(decide, decide.unvalidated_degC)
-    longest_s = _duration_s(_visit(decide, decide.warmest_degC, max(decide.dwells_s)))
-    if left_s < _duration_s(validations) + longest_s:
+    longest_s = usual_s(_visit(decide, decide.warmest_degC, max(decide.dwells_s)))
+    if left_s < usual_s(validations) + longest_s:
         return (*steps, *validations)
-    fixed = round(left_s / _duration_s(_visit(decide, decide.warmest_degC, decide.dwell_s)))
+    fixed = round(left_s / usual_s(_visit(decide, decide.warmest_degC, decide.dwell_s)))
     kept = decide.set_points_degC[max(0, len(decide.set_points_degC) - fixed) :]
     following = replace(decide, set_points_degC=kept, left_s=left_s)
     return (*steps, following, *fixed_visits(following))
@@ -124,7 +124,3 @@ def _visit(decide: Decide, chamber_degC: float, dwell_s: float) -> tuple[Step, .
         Capture(decide.frames, decide.interval_s, decide.exposure_s, role, chamber_degC),
         CloseFlap(),
     )
-
-
-def _duration_s(steps: Sequence[Step]) -> float:
-    return sum(estimate_s(step, 0.0) for step in steps)

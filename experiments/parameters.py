@@ -7,9 +7,12 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from experiments.steps import SOAK_BAND_K, WANTED_STATES, OnUnsettled, WantedState
 from foundation.documents import Document
 
+OnUnsettled = Literal["mark", "hold"]
+WantedState = Literal["at_rest", "on_the_way"]
+WANTED_STATES: tuple[WantedState, ...] = ("at_rest",)
+SOAK_BAND_K = 1.0
 COLDEST_degC, WARMEST_degC = -10.0, 70.0  # the paper's chamber, section 2
 _SHORTEST_DWELL_s = 60.0
 Chamber_degC = Annotated[float, Field(ge=COLDEST_degC, le=WARMEST_degC)]

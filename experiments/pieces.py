@@ -37,21 +37,7 @@ def dwell(dwell_s: float, until: Settled | None, how: Guaranteed, exposure_s: fl
     """The soak at a set-point: `dwell_s`, or at most that."""
     if until is None:
         return soak(dwell_s, how)
-    return soak_until_settled(dwell_s, until, exposure_s, chamber_degC)
-
-
-def soak_until_settled(max_s: float, until: Settled, exposure_s: float, chamber_degC: float) -> SoakUntilSettled:
-    """The soak at a set-point that takes at most `max_s`."""
-    return SoakUntilSettled(
-        max_s=max_s,
-        min_s=until.min_s,
-        window_s=until.window_s,
-        look_every_s=until.look_every_s,
-        camera_K_per_min=until.camera_K_per_min,
-        drift_px_per_min=until.drift_px_per_min,
-        exposure_s=exposure_s,
-        chamber_degC=chamber_degC,
-    )
+    return SoakUntilSettled.until(dwell_s, until, exposure_s, chamber_degC)
 
 
 def placed(table_position: Mapping[str, float]) -> Iterator[Step]:

@@ -9,37 +9,27 @@ import difflib
 import math
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Self, cast
+from functools import cache
+from typing import Annotated, Any, Self, cast
 
-from pydantic import BeforeValidator, Field, StringConstraints, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetJsonSchemaHandler,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    TypeAdapter,
+    ValidationError,
+    create_model,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
-from experiments.parameters import (
-    CaptureParameters,
-    Chamber_degC,
-    FrameCount,
-    Guaranteed,
-    Settled,
-    Wait_s,
-    check_until,
-)
-from experiments.pieces import placed, soak_until_settled
-from experiments.steps import (
-    Capture,
-    CheckHome,
-    CloseFlap,
-    CoolDown,
-    OpenFlap,
-    PowerCamera,
-    Prompt,
-    Role,
-    SetTemperature,
-    Soak,
-    StartChamber,
-    Step,
-    StopChamber,
-    find_fault,
-)
+from experiments.parameters import Chamber_degC
+from experiments.steps import STEPS, SetTemperature, Situation, Soak, Step, kind_of_step
 from foundation.documents import Document
+from foundation.errors import ConfigError
 
 Place = tuple[str | int, ...]  # of an entry within the recipe, as in ("experiments", 0, "steps", 3)
 
@@ -62,70 +52,6 @@ class Written:
 
 class Nothing(Document):
     """A step without parameters."""
-
-
-class CaptureEntry(CaptureParameters):
-    """`frames` images. role: what they are for; `other` frames are recorded and shown, and nothing is fitted to them.
-    chamber_degC: only while the chamber is stopped, the temperature they are made at; else it is the set-point of the
-    steps before. cameras: the names of those that expose, by default all of the stand."""
-
-    frames: FrameCount = 1
-    role: Role = Role.OTHER
-    chamber_degC: Chamber_degC | None = None
-    cameras: tuple[str, ...] = ()
-
-    @model_validator(mode="after")
-    def _has_a_purpose(self) -> Self:
-        if self.role is Role.SETTLING:
-            raise ValueError("role settling is kept for the looks of soak_until_settled; give another one, or none")
-        return self
-
-
-class _Timed(Document):
-    duration_s: Wait_s
-
-
-class SoakEntry(Guaranteed, _Timed):
-    """A guaranteed soak, as the step Soak."""
-
-    last_s: Wait_s | None = None
-    max_s: Wait_s | None = None
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        if reason := find_fault(self.step):
-            raise ValueError(reason)
-        return self
-
-    @property
-    def step(self) -> Soak:
-        """The step."""
-        return Soak(self.duration_s, self.band_K, self.last_s, self.max_s, self.unsettled)
-
-
-def _soak(value: object) -> object:
-    """A number alone is its time, s."""
-    return {"duration_s": value} if isinstance(value, int | float) else value
-
-
-class SoakUntilSettledEntry(Settled):
-    """A soak until the camera has settled, at most `max_s`."""
-
-    max_s: Wait_s = 2700.0
-    exposure_s: float = Field(default=0.1, gt=0, le=10)
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        check_until(self, self.max_s, "max_s")
-        return self
-
-
-class CoolDownEntry(Document):
-    """As the step CoolDown."""
-
-    band_K: float = Field(default=0.5, gt=0, le=20)
-    time_constant_s: float = Field(default=1200.0, gt=0, le=86400)
-    max_s: Wait_s = 7200.0
 
 
 class Repeat(Document):
@@ -165,9 +91,7 @@ def _as_entry(value: object) -> object:
     names = [str(name) for name in entry]
     if len(names) != 1:
         raise ValueError(f"an entry is one step, this one has {' and '.join(names) or 'none'}; begin each with a dash")
-    if names[0] not in StepEntry.model_fields:
-        raise ValueError(unknown("step", names[0], StepEntry.model_fields))
-    return {names[0]: {} if entry[names[0]] is None and names[0] not in _WITH_A_VALUE else entry[names[0]]}
+    return {names[0]: next(iter(entry.values()))}
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> str:
@@ -177,119 +101,112 @@ def unknown(what: str, name: str, known: Iterable[str]) -> str:
     return f"there is no {what} {name[:100]!r}; {advice} {', '.join(known)}"
 
 
-def _as_list(value: object) -> object:
-    return [value] if isinstance(value, str) else value
+@cache
+def _entry_of(step: type[Step]) -> type[Document]:
+    """What an entry of that kind is: one field, by the kind's name. A kind without a value, or whose values all have
+    defaults, needs none behind its colon."""
+    return create_model(step.kind, __base__=Document, **cast("Any", {step.kind: (_form(step), ...)}))
 
 
-_AxisNames = Annotated[
-    tuple[str, ...], Field(min_length=1), BeforeValidator(_as_list, json_schema_input_type=str | tuple[str, ...])
-]
+def _form(step: type[Step]) -> Any:
+    return Nothing if step.form is None else step.form
+
+
+def _needs_value(step: type[Step]) -> bool:
+    try:
+        TypeAdapter(_form(step)).validate_python({})
+    except ValidationError:
+        return True
+    return False
+
+
+def _writable() -> dict[str, type[Step]]:
+    return {kind: step for kind, step in STEPS.items() if step.in_recipes}
 
 
 class StepEntry(Document):
     """One step, repeat or ramp."""
 
-    start_chamber: Chamber_degC | None = None
-    set_temperature: Chamber_degC | None = None
     ramp: Ramp | None = None
-    stop_chamber: Nothing | None = None
-    soak: Annotated[SoakEntry, BeforeValidator(_soak, json_schema_input_type=Wait_s | SoakEntry)] | None = None
-    soak_until_settled: SoakUntilSettledEntry | None = None
-    open_flap: Nothing | None = None
-    close_flap: Nothing | None = None
-    capture: CaptureEntry | None = None
-    move_to: Annotated[dict[str, float], Field(min_length=1)] | None = None
-    check_home: _AxisNames | None = None
-    power_camera: bool | None = None
-    cool_down: CoolDownEntry | None = None
-    prompt: Annotated[str, StringConstraints(min_length=1, max_length=500)] | None = None
     repeat: Repeat | None = None
+    _step: tuple[type[Step], object] | None = PrivateAttr(None)
 
-    @model_validator(mode="after")
-    def _has_a_value(self) -> Self:
-        if getattr(self, self.name) is None:
-            raise ValueError(f"{self.name} needs a value behind its colon")
-        return self
+    @model_validator(mode="wrap")
+    @classmethod
+    def _known(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if isinstance(data, cls):
+            return data
+        ((name, value),) = cast("dict[str, object]", data).items()
+        if name in cls.model_fields:
+            if value is None:
+                raise ValueError(f"{name} needs a value behind its colon")
+            return handler(data)
+        try:
+            step = kind_of_step(name)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        if step is None or not step.in_recipes:
+            raise ValueError(unknown("step", name, [*_writable(), *cls.model_fields]))
+        if value is None:
+            if _needs_value(step):
+                raise ValueError(f"{name} needs a value behind its colon")
+            value = {}
+        entry = cls.model_construct()
+        entry._step = (step, getattr(_entry_of(step).model_validate({name: value}), name))
+        return entry
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        schema = handler(core)
+        whole = handler.resolve_ref_schema(schema)
+        fields = {kind: (_form(step) | None, None) for kind, step in _writable().items()}
+        forms = create_model("Forms", **cast("Any", fields))
+        kinds = handler.resolve_ref_schema(handler(forms.__pydantic_core_schema__))
+        whole["properties"] = kinds["properties"] | whole["properties"]
+        return schema
 
     @property
     def name(self) -> str:
         """Its one key."""
+        if self._step is not None:
+            return self._step[0].kind
         (name,) = self.model_fields_set
         return name
 
+    def steps(self, place: Place, at_degC: float | None) -> Iterator[Step]:
+        """The steps of an entry that is neither repeat nor ramp. Raises PlanError."""
+        if self._step is not None:
+            step, value = self._step
+            try:
+                yield from step.of_form(value, at_degC)
+            except ValueError as error:
+                raise PlanError(place, str(error)) from error
 
-_WITH_A_VALUE = frozenset(
-    {"start_chamber", "set_temperature", "soak", "move_to", "check_home", "power_camera", "prompt"}
-)
+
 StepEntries = tuple[Annotated[StepEntry, BeforeValidator(_as_entry, json_schema_input_type=str | StepEntry)], ...]
 Repeat.model_rebuild()
 Ramp.model_rebuild()
 StepEntry.model_rebuild()
 
 
-def written_steps(
-    entries: Sequence[StepEntry], place: Place, at_degC: float | None
-) -> Generator[Written, None, float | None]:
-    """The steps of `entries`, which stand at `place`. at_degC: the set-point before them, None when the chamber is
-    stopped; that after them is returned. Raises PlanError."""
+def written_steps(entries: Sequence[StepEntry], place: Place, found: Situation) -> Generator[Written, None, Situation]:
+    """The steps of `entries`, which stand at `place`. found: what the steps before them leave; what these leave is
+    returned. Raises PlanError."""
     for number, entry in enumerate(entries):
         here = (*place, number, entry.name)
-        match getattr(entry, entry.name):
-            case Repeat() as repeat:
-                for _ in range(repeat.times):
-                    at_degC = yield from written_steps(repeat.steps, (*here, "steps"), at_degC)
-            case Ramp() as ramp:
-                if at_degC is None:
-                    raise PlanError(here, "a ramp begins at a set-point; give start_chamber before it")
-                for degC, soak_s in ramp.set_points(at_degC):
-                    yield Written(here, SetTemperature(degC))
-                    yield Written(here, Soak(soak_s, band_K=0.0))
-                    at_degC = yield from written_steps(ramp.steps, (*here, "steps"), degC)
-            case value:
-                for step in _steps(entry.name, value, here, at_degC):
+        if entry.repeat is not None:
+            for _ in range(entry.repeat.times):
+                found = yield from written_steps(entry.repeat.steps, (*here, "steps"), found)
+        elif entry.ramp is not None:
+            if found.set_point_degC is None:
+                raise PlanError(here, "a ramp begins at a set-point; give start_chamber before it")
+            for degC, soak_s in entry.ramp.set_points(found.set_point_degC):
+                for step in (SetTemperature(degC), Soak(soak_s, band_K=0.0)):
                     yield Written(here, step)
-                    at_degC = set_point_after(step, at_degC)
-    return at_degC
-
-
-def set_point_after(step: Step, at_degC: float | None) -> float | None:
-    """The chamber's set-point, degC, when the step is done; None when the chamber is stopped."""
-    if isinstance(step, StartChamber | SetTemperature):
-        return step.chamber_degC
-    return None if isinstance(step, StopChamber) else at_degC
-
-
-def _steps(name: str, value: object, place: Place, at_degC: float | None) -> Iterable[Step]:
-    match name, value:
-        case "start_chamber", float(degC):
-            return (StartChamber(degC),)
-        case "set_temperature", float(degC):
-            return (SetTemperature(degC),)
-        case _, SoakEntry() as soak:
-            return (soak.step,)
-        case _, SoakUntilSettledEntry(max_s=max_s, exposure_s=exposure_s) as until:
-            return (soak_until_settled(max_s, until, exposure_s, _known(at_degC, place, "start_chamber before it")),)
-        case _, CaptureEntry() as capture:
-            degC = at_degC if capture.chamber_degC is None else capture.chamber_degC
-            degC = _known(degC, place, "start_chamber before it, or chamber_degC")
-            return (
-                Capture(capture.frames, capture.interval_s, capture.exposure_s, capture.role, degC, capture.cameras),
-            )
-        case "move_to", dict() as positions:
-            return placed(cast("dict[str, float]", positions))
-        case "check_home", tuple() as axes:
-            return (CheckHome(axis) for axis in cast("tuple[str, ...]", axes))
-        case "power_camera", bool(on):
-            return (PowerCamera(on),)
-        case _, CoolDownEntry() as wait:
-            return (CoolDown(wait.band_K, wait.time_constant_s, wait.max_s),)
-        case "prompt", str(text):
-            return (Prompt(text),)
-        case _:
-            return ({"stop_chamber": StopChamber, "open_flap": OpenFlap, "close_flap": CloseFlap}[name](),)
-
-
-def _known(degC: float | None, place: Place, remedy: str) -> float:
-    if degC is None:
-        raise PlanError(place, f"the chamber has no set-point here; give {remedy}")
-    return degC
+                    found = step.leaves(found)
+                found = yield from written_steps(entry.ramp.steps, (*here, "steps"), found)
+        else:
+            for step in entry.steps(here, found.set_point_degC):
+                yield Written(here, step)
+                found = step.leaves(found)
+    return found

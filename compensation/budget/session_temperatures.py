@@ -50,7 +50,7 @@ def mean_state(states: Sequence[StandTemperatures]) -> StandTemperatures:
 
 def capture_states(session: Session) -> list[CaptureState]:
     """Every capture that was completed, in order; SessionError when there is none."""
-    started = {mark.step_id: mark for mark in session.steps() if mark.kind == "Capture" and mark.state == "started"}
+    started = {mark.step_id: mark for mark in session.steps() if mark.kind == "capture" and mark.state == "started"}
     ended = {mark.step_id: mark.time_ns for mark in session.steps() if mark.state == StepState.DONE}
     marks = [mark for mark in started.values() if mark.step_id in ended]
     if not marks:

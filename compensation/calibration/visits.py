@@ -34,14 +34,14 @@ def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, V
     since_ns: dict[str, int] = {}
     visits: dict[str, Visit] = {}
     for mark in steps:
-        if mark.kind == "MoveTo":
+        if mark.kind == "move_to":
             axis = str(mark.parameters.get("axis"))
             if mark.state is StepState.STARTED:
                 for visit in visits.values():
                     visit.until_ns.setdefault(axis, mark.time_ns)
             elif mark.state is StepState.DONE:
                 sent[axis], since_ns[axis] = float(str(mark.parameters.get("position"))), mark.time_ns
-        elif mark.kind == "Capture" and mark.parameters.get("role") in roles and mark.state is StepState.STARTED:
+        elif mark.kind == "capture" and mark.parameters.get("role") in roles and mark.state is StepState.STARTED:
             role = str(mark.parameters["role"])
             if not all(axis in sent for axis in AXES):
                 raise SessionError(f"step {mark.index + 1}: a {role} capture, but no move of both axes before it")

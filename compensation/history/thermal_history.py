@@ -127,7 +127,7 @@ def _powered(session: Session) -> tuple[TimesNs, Float]:
     switched = [
         (mark.time_ns, float(bool(mark.parameters.get("on"))))
         for mark in session.steps()
-        if mark.kind == "PowerCamera" and mark.state is StepState.STARTED
+        if mark.kind == "power_camera" and mark.state is StepState.STARTED
     ]
     times_ns = np.concatenate([times_ns, np.array([time_ns for time_ns, _ in switched], np.int64)])
     values = np.concatenate([values, [on for _, on in switched]])

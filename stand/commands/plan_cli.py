@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from experiments.looks import looks_of
-from experiments.steps import Step, kind_of, parameters_of
+from experiments.steps import Step
 from foundation.clock import WallClock, seconds_ns
 from foundation.command_app import App
 from foundation.ending import Ending
@@ -102,7 +102,7 @@ def simulate(
 def _line(step: PricedStep) -> str:
     planned = step.planned
     return (
-        f"{planned.index + 1:4d}  {planned.step_id}  {kind_of(planned.step):<16s}"
+        f"{planned.index + 1:4d}  {planned.step_id}  {planned.step.kind:<18s}"
         f"{_parameters(planned.step):<72s}{_hours(step.duration_s):>12s}"
         + (f"{step.frames:6d} frames {step.size_bytes / 1e6:8.1f} MB" if step.frames else "")
         + (f"   in band after {_hours(step.in_band_after_s)}" if step.in_band_after_s else "")
@@ -111,7 +111,7 @@ def _line(step: PricedStep) -> str:
 
 
 def _parameters(step: Step) -> str:
-    return " ".join(f"{name}={value}" for name, value in parameters_of(step).items())
+    return " ".join(f"{name}={value}" for name, value in step.parameters.items())
 
 
 def _hours(duration_s: float) -> str:

@@ -12,13 +12,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from importlib.metadata import EntryPoint, entry_points
 from itertools import islice
-from typing import cast, get_type_hints
+from typing import Any, cast, get_type_hints
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from experiments.sequence import MOST_STEPS
-from experiments.steps import Step, kind_of
+from experiments.steps import Step
 from foundation.document_faults import words
 
 GROUP = "thermostand.experiments"
@@ -82,7 +82,7 @@ def _fault(step: object) -> str:
     """Why this is no step that a stand can do; "" when it is one."""
     if not isinstance(step, Step):
         return f"is no step of experiments.steps but {type(step).__name__}"
-    for name in [field.name for field in fields(step)]:
+    for name in [field.name for field in fields(cast("Any", step))]:
         value = getattr(step, name)
         if name in ("axis", "text", "role", "on", "unsettled"):
             continue
@@ -97,7 +97,7 @@ def _fault(step: object) -> str:
                 isinstance(each, float | int) and least <= each < math.inf for each in numbers if each is not None
             )
         if not is_right:
-            return f"({kind_of(step)}) has {name} {value!r}"
+            return f"({step.kind}) has {name} {value!r}"
     return ""
 
 

@@ -10,11 +10,11 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from experiments.calibration import Calibration, calibration
 from experiments.sequence import checked
-from experiments.steps import PlannedStep, Step, number_steps
+from experiments.steps import PlannedStep, Situation, Step, number_steps
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
-from experiments.written import Place, PlanError, StepEntries, Written, set_point_after, unknown, written_steps
+from experiments.written import Place, PlanError, StepEntries, Written, unknown, written_steps
 from foundation.documents import Document
 from stand.config.added_experiments import added_names, added_steps, package_of
 
@@ -71,10 +71,10 @@ class Experiment(Document):
         """The package that adds the entry's experiment, and its version; "" for our own."""
         return package_of(self._added[0]) if self._added[0] else ""
 
-    def sequence(self, place: Place = (), at_degC: float | None = None) -> Generator[Written, None, None]:
-        """The steps of this entry, which stands at `place`; at_degC: the set-point before them."""
+    def sequence(self, place: Place = (), found: Situation | None = None) -> Generator[Written, None, None]:
+        """The steps of this entry, which stands at `place`; found: what those before it leave."""
         if self.steps is not None:
-            yield from written_steps(self.steps, (*place, "steps"), at_degC)
+            yield from written_steps(self.steps, (*place, "steps"), found or Situation())
             return
         name, steps = self._added
         if not name:
@@ -135,9 +135,9 @@ class Recipe(Document):
         return tuple(sorted({experiment.package for experiment in self.experiments} - {""}))
 
     def _written(self) -> Iterator[Written]:
-        at_degC: float | None = None
+        found = Situation()
         for number, experiment in enumerate(self.experiments):
-            for written in experiment.sequence(("experiments", number), at_degC):
+            for written in experiment.sequence(("experiments", number), found):
                 yield written
-                at_degC = set_point_after(written.step, at_degC)
-        yield from written_steps(self.steps, ("steps",), at_degC)
+                found = written.step.leaves(found)
+        yield from written_steps(self.steps, ("steps",), found)

@@ -34,8 +34,8 @@ _CAMERA_MEAN_S = 60.0  # several such steps are averaged
 _FIT_POINTS = 41
 _PRIOR_S = 0.5  # what a factor of e away from the defaults must gain in the mean error
 
-_SETS = ("StartChamber", "SetTemperature")
-_DISTURBS = (*_SETS, "StopChamber", "OpenFlap")  # what ends the undisturbed approach to a set-point
+_SETS = ("start_chamber", "set_temperature")
+_DISTURBS = (*_SETS, "stop_chamber", "open_flap")  # what ends the undisturbed approach to a set-point
 
 
 class Response(Document):

@@ -8,42 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 from drivers.devices.motion.stage import AxisSettings
 from drivers.devices.motion.stage_profiles import StageProfile
-from experiments.steps import (
-    Capture,
-    CheckHome,
-    CloseFlap,
-    CoolDown,
-    MoveTo,
-    OpenFlap,
-    PowerCamera,
-    SetTemperature,
-    Soak,
-    SoakUntilSettled,
-    StartChamber,
-    Step,
-    estimate_s,
-    kind_of,
-    last_part_s,
-    longest_s,
-)
+from experiments.steps import KnownStand, Price, Situation, Step
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
+from stand.estimating.camera_lines import overloaded
 from stand.estimating.chamber_model import ChamberModel
-
-# Until recorded nights have shown better, s: a flap's travel with its confirmation, homing from near the switch.
-_FLAP_TRAVEL_S = 3.0
-_FLAP_AT_REST_S = 0.2
-_HOMING_S = 15.0
-_MOVE_CONFIRMED_S = 0.1
-
-COOL_DOWN_AS_FOUND = "cool down as found"  # of a camera that the run finds as warm as it happens to be
-
-LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
 
 
 def move_s(stage: StageProfile, steps: float) -> float:
@@ -55,133 +29,112 @@ def move_s(stage: StageProfile, steps: float) -> float:
     return way / speed + speed * slow / 2.0 if speed > 0.0 else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Situation:
-    """What a step finds: the flap, whether the plan has had the camera on (before that its temperature is unknown),
-    where each axis stands (mm or deg; one that is missing is not homed), the last two set-points, and what was soaked
-    since, s: the first soak is taken to begin when the chamber sets off from the one to the other."""
+class ConfiguredStand(KnownStand):
+    """What is known of a stand by its file, and by its chamber's model."""
 
-    flap_open: bool = False
-    camera_was_on: bool = False
-    positions: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    from_degC: float = LABORATORY_degC
-    to_degC: float = LABORATORY_degC
-    soaked_s: float = 0.0
+    def __init__(self, config: StandConfig, chamber: ChamberModel | None = None) -> None:
+        self._config = config
+        self._chamber = chamber or ChamberModel()
+        self.boot_s = max((camera.boot_s for camera in config.cameras.values()), default=0.0)
 
-    def after(self, step: Step) -> Situation:
-        """What the step leaves behind."""
-        match step:
-            case OpenFlap():
-                return replace(self, flap_open=True)
-            case CloseFlap():
-                return replace(self, flap_open=False)
-            case PowerCamera(on=True) | Capture():
-                return replace(self, camera_was_on=True)
-            case StartChamber(chamber_degC) | SetTemperature(chamber_degC):
-                return replace(self, from_degC=self.to_degC, to_degC=chamber_degC, soaked_s=0.0)
-            case Soak(duration_s):
-                return replace(self, soaked_s=self.soaked_s + duration_s)
-            case MoveTo(axis, position):
-                return replace(self, positions=MappingProxyType({**self.positions, axis: position}))
-            case _:
-                return self
+    def set_point_way_s(self, from_degC: float, to_degC: float) -> float:
+        """As the stand's ramp goes."""
+        return 60.0 * abs(to_degC - from_degC) / self._config.set_point_K_per_min
 
+    def arrival_s(self, from_degC: float, to_degC: float, band_K: float) -> float | None:
+        """None until a recorded run has shown a ramp of this direction."""
+        ramps = self._chamber.heating_ramps if to_degC > from_degC else self._chamber.cooling_ramps
+        return self._chamber.arrival_s(from_degC, to_degC, band_K) if ramps else None
 
-@dataclass(frozen=True, slots=True)
-class Expectation:
-    """`stated_s` follows from the step and its situation; `overhead_s` is what `work` of this kind takes beyond it."""
+    def settling_s(self, from_degC: float, to_degC: float, camera_K_per_min: float) -> float:
+        """The chamber arrives, the camera follows with its time constant."""
+        first_K_per_min = 60.0 * abs(to_degC - from_degC) / self._chamber.camera_time_constant_s
+        slowing_s = self._chamber.camera_time_constant_s * math.log(max(1.0, first_K_per_min / camera_K_per_min))
+        return self._chamber.arrival_s(from_degC, to_degC) + slowing_s
 
-    work: str
-    stated_s: float
-    overhead_s: float
+    def move_s(self, axis: str, begin: float, end: float) -> float:
+        """As the driver moves: when not from below, past the end first, then up to it."""
+        profile = self._axis(axis).stage
+        below = end - profile.overshoot
+        ways = (begin - below, profile.overshoot) if begin > below else (end - begin,)
+        return sum(move_s(profile, way / profile.unit_per_step) for way in ways)
 
-    @property
-    def duration_s(self) -> float:
-        """Together, s."""
-        return max(0.0, self.stated_s + self.overhead_s)
+    def to_home_s(self, axis: str, position: float) -> float:
+        """At the speed of homing."""
+        stage = self._axis(axis).stage
+        return abs(position) / stage.unit_per_step / stage.homing_speed
+
+    def set_point_fault(self, chamber_degC: float) -> str:
+        """The stand's limits, and those of each camera."""
+        cameras = {f"cameras.{name}.ambient_degC": each.ambient_degC for name, each in self._config.cameras.items()}
+        for key, limits_degC in {"limits.chamber_degC": self._config.limits.chamber_degC, **cameras}.items():
+            if limits_degC is not None and not limits_degC[0] <= chamber_degC <= limits_degC[1]:
+                return f"{chamber_degC} degC is outside {key} {limits_degC[0]}..{limits_degC[1]}"
+        return ""
+
+    def camera_fault(self) -> str:
+        """Of a stand without one."""
+        if self._config.cameras:
+            return ""
+        return "needs a camera, and this stand has none; name it under cameras in the stand's file"
+
+    def supply_fault(self) -> str:
+        """Of a stand without relays."""
+        if self._config.relays is not None:
+            return ""
+        return "no relay switches the cameras, which stay on: this stand has no relay board; leave it out"
+
+    def exposure_fault(self, chamber_degC: float) -> str:
+        """The dew point of the laboratory's air, where that is known."""
+        lowest_degC = math.nan if self._config.dew is None else self._config.dew.lowest_degC(math.nan)
+        if math.isnan(lowest_degC) or chamber_degC >= lowest_degC:
+            return ""
+        return (
+            f"at {chamber_degC} degC the open flap lets the laboratory's air in, whose dew point with dew.margin_K is "
+            f"{lowest_degC:g} degC; leave the set-point out, or dry the air and change dew"
+        )
+
+    def rate_fault(self, cameras: tuple[str, ...], interval_s: float | None) -> str:
+        """The stand's cameras, their line and their rates."""
+        known = self._config.cameras
+        if unknown := [name for name in cameras if name not in known]:
+            return f"this stand has no camera {unknown[0]}; it has {', '.join(known) or 'none'}"
+        if interval_s is None:
+            return ""
+        if reason := overloaded(self._config, interval_s):
+            return reason
+        for name, camera in known.items():
+            if interval_s < 1 / camera.frame_rate_hz - 1e-9:
+                return (
+                    f"a frame every {interval_s} s is faster than cameras.{name}.frame_rate_hz {camera.frame_rate_hz}"
+                )
+        return ""
+
+    def axis_fault(self, axis: str, position: float | None) -> str:
+        """The limits: also homing ends at 0, for an axis without scale before it moves."""
+        settings = self._axis(axis)
+        low, high = settings.limits
+        if position is not None and not low <= position <= high:
+            return f"{position} {settings.unit} is outside the limits {settings.limits} of {axis}"
+        # A home check begins at the profile's place.
+        ways = (0.0, settings.stage.home_from if position is None else None)
+        outside = [place for place in ways if place is not None and not low <= place <= high]
+        if not outside:
+            return ""
+        return (
+            f"homing {axis} goes to {outside[0]:g} {settings.unit}, which axes.{axis}.limits {settings.limits} exclude"
+        )
+
+    def _axis(self, name: str) -> AxisSettings:
+        axis = next((axis for known, axis in self._config.axes.items() if known == name), None)
+        if axis is None:
+            raise ConfigError(f"this stand has no axis {name!r}, only {', '.join(self._config.axes) or 'none'}")
+        return axis
 
 
 def expect(
-    step: Step,
-    found: Situation,
-    config: StandConfig,
-    overheads_s: Mapping[str, float] = MappingProxyType({}),
-    chamber: ChamberModel | None = None,
-) -> Expectation:
-    """What the step takes in the situation it finds; `overheads_s` was learned, by kind of work, with `chamber`."""
-    usual = _usual(step, found, config, chamber or ChamberModel())
+    step: Step, found: Situation, stand: KnownStand, overheads_s: Mapping[str, float] = MappingProxyType({})
+) -> Price:
+    """What the step takes in the situation it finds; `overheads_s` was learned, by kind of work."""
+    usual = step.price(found, stand)
     return replace(usual, overhead_s=overheads_s.get(usual.work, usual.overhead_s))
-
-
-def axis_of(config: StandConfig, name: str) -> AxisSettings:
-    """The stand's axis of that name; ConfigError when it has none."""
-    axis = next((axis for known, axis in config.axes.items() if known == name), None)
-    if axis is None:
-        raise ConfigError(f"this stand has no axis {name!r}, only {', '.join(config.axes) or 'none'}")
-    return axis
-
-
-def soak_s(soak: Soak, found: Situation, chamber: ChamberModel) -> float:
-    """How long the soak is expected to take, s: until the chamber has been in its band for its last part, too, once
-    recorded runs have shown how fast it is."""
-    ramps = chamber.heating_ramps if found.to_degC > found.from_degC else chamber.cooling_ramps
-    if not soak.band_K or not ramps:
-        return soak.duration_s
-    arrives_s = chamber.arrival_s(found.from_degC, found.to_degC, soak.band_K) - found.soaked_s
-    return min(longest_s(soak), max(soak.duration_s, arrives_s + last_part_s(soak)))
-
-
-def settling_s(soak: SoakUntilSettled, found: Situation, chamber: ChamberModel) -> float:
-    """How long the soak is expected to take, s: the chamber arrives, the camera follows with its time constant until it
-    is slow enough, and then it has to stay so. How the image drifts is unknown until it was seen once."""
-    gap_K = abs(found.to_degC - found.from_degC)
-    first_K_per_min = 60.0 * gap_K / chamber.camera_time_constant_s
-    slowing_s = chamber.camera_time_constant_s * math.log(max(1.0, first_K_per_min / soak.camera_K_per_min))
-    expected_s = chamber.arrival_s(found.from_degC, found.to_degC) + slowing_s + soak.window_s
-    return min(soak.max_s, max(soak.min_s, expected_s))
-
-
-def _usual(step: Step, found: Situation, config: StandConfig, chamber: ChamberModel) -> Expectation:
-    match step:
-        case OpenFlap() | CloseFlap():
-            travels = found.flap_open is not isinstance(step, OpenFlap)
-            work = "flap travel" if travels else "flap at rest"
-            return Expectation(work, 0.0, _FLAP_TRAVEL_S if travels else _FLAP_AT_REST_S)
-        case MoveTo(axis, position):
-            stage = axis_of(config, axis)
-            if axis not in found.positions:
-                return Expectation(f"home and move {axis}", _move_s(stage, 0.0, position), _HOMING_S)
-            return Expectation(f"move {axis}", _move_s(stage, found.positions[axis], position), _MOVE_CONFIRMED_S)
-        case CheckHome(axis):
-            stage, position = axis_of(config, axis), found.positions.get(axis, 0.0)
-            return Expectation(
-                f"check home {axis}", _to_home_s(stage, position) + _move_s(stage, 0.0, position), _HOMING_S
-            )
-        case StartChamber(chamber_degC) | SetTemperature(chamber_degC):
-            way_s = 60.0 * abs(chamber_degC - found.to_degC) / config.set_point_K_per_min
-            return Expectation(kind_of(step), way_s, 0.0)
-        case CoolDown():
-            work = kind_of(step) if found.camera_was_on else COOL_DOWN_AS_FOUND
-            return Expectation(work, estimate_s(step, _boot_s(config)), 0.0)
-        case Soak():
-            return Expectation(kind_of(step), soak_s(step, found, chamber), 0.0)
-        case SoakUntilSettled():
-            return Expectation(kind_of(step), settling_s(step, found, chamber), 0.0)
-        case _:
-            return Expectation(kind_of(step), estimate_s(step, _boot_s(config)), 0.0)
-
-
-def _boot_s(config: StandConfig) -> float:
-    return max((camera.boot_s for camera in config.cameras.values()), default=0.0)
-
-
-def _move_s(axis: AxisSettings, begin: float, end: float) -> float:
-    """As the driver moves: when not from below, past the end first, then up to it."""
-    profile = axis.stage
-    below = end - profile.overshoot
-    ways = (begin - below, profile.overshoot) if begin > below else (end - begin,)
-    return sum(move_s(profile, way / profile.unit_per_step) for way in ways)
-
-
-def _to_home_s(axis: AxisSettings, position: float) -> float:
-    return abs(position) / axis.stage.unit_per_step / axis.stage.homing_speed

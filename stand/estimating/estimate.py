@@ -7,30 +7,24 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from experiments.steps import (
+    COOL_DOWN_AS_FOUND,
     AnySoak,
     Capture,
-    CheckHome,
     CoolDown,
-    MoveTo,
+    KnownStand,
+    LABORATORY_degC,
     PlannedStep,
-    PowerCamera,
     SetTemperature,
+    Situation,
     Soak,
     SoakUntilSettled,
     StartChamber,
     Step,
-    estimate_s,
-    frames_of,
-    kind_of,
-    last_part_s,
-    longest_s,
-    parameters_of,
 )
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
-from stand.estimating.camera_lines import overloaded
 from stand.estimating.chamber_model import ChamberModel
-from stand.estimating.durations import COOL_DOWN_AS_FOUND, LABORATORY_degC, Situation, axis_of, expect
+from stand.estimating.durations import ConfiguredStand, expect
 from stand.estimating.learned import Learned
 
 # Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
@@ -66,8 +60,8 @@ class PricedStep:
         return {
             "index": self.planned.index,
             "id": self.planned.step_id,
-            "kind": kind_of(self.planned.step),
-            "parameters": parameters_of(self.planned.step),
+            "kind": self.planned.step.kind,
+            "parameters": self.planned.step.parameters,
             "duration_s": self.duration_s,
             "frames": self.frames,
             "bytes": round(self.size_bytes),
@@ -90,7 +84,7 @@ class _Approach:
         if isinstance(step, StartChamber | SetTemperature):
             return _Approach(self.to_degC, step.chamber_degC, duration_s)
         # A soak that waits for the camera has time enough when its longest is enough.
-        lasts_s = longest_s(step) if isinstance(step, SoakUntilSettled) else duration_s
+        lasts_s = step.longest_s if isinstance(step, SoakUntilSettled) else duration_s
         return replace(self, age_s=self.age_s + lasts_s, captured=self.captured or isinstance(step, Capture))
 
 
@@ -102,12 +96,13 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
         (camera.width_px or _SENSOR_PX[0]) * (camera.height_px or _SENSOR_PX[1]) for camera in config.cameras.values()
     )
     telemetry_bytes_per_s = _messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
-    found, approach = Situation(), _Approach(LABORATORY_degC, LABORATORY_degC)
+    stand, found = ConfiguredStand(config, learned.chamber), Situation()
+    approach = _Approach(LABORATORY_degC, LABORATORY_degC)
     priced: list[PricedStep] = []
     for planned in plan:
-        check_step(planned, config)
+        check_step(planned, stand)
         step = planned.step
-        expected = expect(step, found, config, learned.overheads_s, learned.chamber)
+        expected = expect(step, found, stand, learned.overheads_s)
         duration_s = expected.duration_s
         in_band_after_s = _in_band_after_s(step, approach, learned.chamber)
         frames = _frames(step, duration_s, in_band_after_s)
@@ -126,7 +121,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
                 or _unknown(expected.work, learned),
             )
         )
-        found, approach = found.after(step), approach.after(step, duration_s)
+        found, approach = step.leaves(found), approach.after(step, duration_s)
     total_s = sum(step.duration_s for step in priced)
     if total_s > _LONGEST_S:
         raise ConfigError(f"the plan takes {total_s / 86400:.0f} days; more than a year is refused")
@@ -160,7 +155,7 @@ def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> 
 def _frames(step: Step, duration_s: float, in_band_after_s: float | None) -> int:
     """Of a soak: its looks, from when the chamber is in its band."""
     if not isinstance(step, SoakUntilSettled):
-        return frames_of(step)
+        return step.frame_count
     return max(0, math.ceil((duration_s - (in_band_after_s or 0.0)) / step.look_every_s))
 
 
@@ -176,9 +171,10 @@ def _warning(step: Step, approach: _Approach, chamber: ChamberModel, expected_s:
     cool-down: that it is too short for a camera that was on. Of a soak that is expected to take expected_s: that it
     will not end in its time."""
     if isinstance(step, CoolDown):
-        needed_s = estimate_s(replace(step, max_s=math.inf), 0.0)
-        too_short = f"ends after {_minutes(step.max_s)}; the camera needs {_minutes(needed_s)} to be within its band"
-        return f"the cool-down {too_short}" if step.max_s < needed_s else ""
+        too_short = (
+            f"ends after {_minutes(step.max_s)}; the camera needs {_minutes(step.needed_s)} to be within its band"
+        )
+        return f"the cool-down {too_short}" if step.max_s < step.needed_s else ""
     if isinstance(step, Soak):
         return _longer(step, approach, chamber, expected_s)
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC)
@@ -199,7 +195,7 @@ def _longer(soak: Soak, approach: _Approach, chamber: ChamberModel, expected_s: 
         return ""
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC, soak.band_K) - approach.age_s
     arrival = f"the chamber is within {soak.band_K:g} K of {approach.to_degC:g} degC after {_minutes(arrives_s)}"
-    if arrives_s + last_part_s(soak) <= longest_s(soak):
+    if arrives_s + soak.last_part_s <= soak.longest_s:
         return f"{arrival}: the soak is expected to go on until {_minutes(expected_s)}"
     end = "the run is held then" if soak.unsettled == "hold" else "the frames after it are marked as unsettled"
     return f"{arrival}: too late for a soak of at most {_minutes(expected_s)}; {end}"
@@ -236,61 +232,13 @@ def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
     return whole * _BYTES_PER_PIXEL["png"] + (frames - whole) * _BYTES_PER_PIXEL[recording.frame_encoding]
 
 
-def _check_set_point(chamber_degC: float, where: str, config: StandConfig) -> None:
-    cameras = {f"cameras.{name}.ambient_degC": camera.ambient_degC for name, camera in config.cameras.items()}
-    for key, limits_degC in {"limits.chamber_degC": config.limits.chamber_degC, **cameras}.items():
-        if limits_degC is not None and not limits_degC[0] <= chamber_degC <= limits_degC[1]:
-            low, high = limits_degC
-            raise ConfigError(f"{where}: {chamber_degC} degC is outside {key} {low}..{high}")
-
-
-def check_step(planned: PlannedStep, config: StandConfig) -> None:
+def check_step(planned: PlannedStep, stand: KnownStand) -> None:
     """ConfigError, naming the step, when it is nothing for this stand or outside its limits."""
     step = planned.step
-    where = f"step {planned.index + 1} ({kind_of(step)})"
-    if isinstance(step, StartChamber | SetTemperature):
-        _check_set_point(step.chamber_degC, where, config)
-    if isinstance(step, Capture | SoakUntilSettled) and config.dew is not None:
-        lowest_degC = config.dew.lowest_degC(math.nan)
-        if step.chamber_degC < lowest_degC:
-            raise ConfigError(
-                f"{where}: at {step.chamber_degC} degC the open flap lets the laboratory's air in, whose dew point "
-                f"with dew.margin_K is {lowest_degC:g} degC; leave the set-point out, or dry the air and change dew"
-            )
-    if isinstance(step, MoveTo | CheckHome):
-        try:
-            axis = axis_of(config, step.axis)
-        except ConfigError as error:
-            raise ConfigError(f"{where}: {error}") from error
-        low, high = axis.limits
-        if isinstance(step, MoveTo) and not low <= step.position <= high:
-            raise ConfigError(
-                f"{where}: {step.position} {axis.unit} is outside the limits {axis.limits} of {step.axis}"
-            )
-        # An axis without scale is homed before it moves, which ends at 0; a home check begins at the profile's place.
-        home_from = axis.stage.home_from if isinstance(step, CheckHome) else None
-        outside = [place for place in (0.0, home_from) if place is not None and not low <= place <= high]
-        if outside:
-            raise ConfigError(
-                f"{where}: homing {step.axis} goes to {outside[0]:g} {axis.unit}, which axes.{step.axis}.limits "
-                f"{axis.limits} exclude"
-            )
-    if isinstance(step, Capture | SoakUntilSettled | PowerCamera | CoolDown) and not config.cameras:
-        raise ConfigError(
-            f"{where}: needs a camera, and this stand has none; name it under cameras in the stand's file"
-        )
-    if step == PowerCamera(on=False) and config.relays is None:
-        raise ConfigError(
-            f"{where}: no relay switches the cameras, which stay on: this stand has no relay board; leave it out"
-        )
-    if isinstance(step, Capture) and (unknown := [name for name in step.cameras if name not in config.cameras]):
-        known = ", ".join(config.cameras) or "none"
-        raise ConfigError(f"{where}: this stand has no camera {unknown[0]}; it has {known}")
-    if isinstance(step, Capture) and step.frames > 1 and (reason := overloaded(config, step.interval_s)):
-        raise ConfigError(f"{where}: {reason}")
-    for name, camera in config.cameras.items():
-        if isinstance(step, Capture) and step.frames > 1 and step.interval_s < 1 / camera.frame_rate_hz - 1e-9:
-            raise ConfigError(
-                f"{where}: a frame every {step.interval_s} s is faster than cameras.{name}.frame_rate_hz "
-                f"{camera.frame_rate_hz}"
-            )
+    where = f"step {planned.index + 1} ({step.kind})"
+    try:
+        fault = step.refused(stand)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    if fault:
+        raise ConfigError(f"{where}: {fault}")

@@ -10,7 +10,7 @@ from statistics import median_low
 from types import MappingProxyType
 from typing import Any, cast
 
-from experiments.steps import estimate_s, frames_of, kind_of, number_steps, step_of
+from experiments.steps import KnownStand, Situation, number_steps, step_of
 from foundation.clock import NS_PER_S
 from foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, PLAN_CHANGED, SOAK_LONGER, TO_AMBIENT
 from foundation.items import Event, StepMark, StepState
@@ -153,11 +153,13 @@ class Eta:
                 self._forget(index)
             steps = (step_of(each["kind"], each["parameters"]) for each in cast("list[dict[str, Any]]", by))
             del self._steps[first:]
+            found = Situation()
             for planned in number_steps(steps, first):
-                stated_s, work = estimate_s(planned.step, 0.0), kind_of(planned.step)
+                price, step = planned.step.price(found, KnownStand()), planned.step
+                found, stated_s, work = step.leaves(found), price.duration_s, step.kind
                 self._overhead_s.setdefault(work, 0.0)
                 self._seen_s.setdefault(work, deque([0.0], _REMEMBERED))
-                self._steps.append(PricedStep(planned, stated_s, frames_of(planned.step), 0.0, work, stated_s))
+                self._steps.append(PricedStep(planned, stated_s, step.frame_count, 0.0, work, stated_s))
                 self._expected_s[planned.step_id] = stated_s
                 self._wait_for(planned.index)
             return

@@ -8,21 +8,20 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from statistics import median
-from typing import get_args
 
 from pydantic import Field
 
-from experiments.steps import Role, Step
+from experiments.steps import Situation, Step, step_of
 from foundation.clock import NS_PER_S
 from foundation.documents import Document, yaml_data
-from foundation.errors import SessionError
+from foundation.errors import ConfigError, SessionError
 from foundation.files import replace_file
 from foundation.items import StepMark, StepState
 from foundation.sealed import seal, unseal
 from recording.reading.session import Session
 from stand.config.stand_config import StandConfig
 from stand.estimating.chamber_model import ChamberModel, Ramp, fit, ramps_of
-from stand.estimating.durations import Situation, expect
+from stand.estimating.durations import ConfiguredStand, expect
 
 LEARNED_FILE = "learned.json"
 _KIND = "learned"
@@ -96,24 +95,22 @@ def overheads_of(
 ) -> list[tuple[str, float]]:
     """(kind of work, s beyond what is stated) of every step of a session that was done in one go, in order; `config` is
     the stand's as it is now, `chamber` its model. Steps that are not known any more are left out."""
-    found, overheads = Situation(), list[tuple[str, float]]()
+    stand, found, overheads = ConfiguredStand(config, chamber), Situation(), list[tuple[str, float]]()
     for mark, duration_s in _done(marks):
         step = _step_of(mark)
         if step is None:
             continue
         if duration_s is not None:
-            expected = expect(step, found, config, chamber=chamber)
+            expected = expect(step, found, stand)
             overheads.append((expected.work, duration_s - expected.stated_s))
-        found = found.after(step)
+        found = step.leaves(found)
     return overheads
 
 
 def _step_of(mark: StepMark) -> Step | None:
-    kind = next((kind for kind in get_args(Step) if kind.__name__ == mark.kind), None)
-    values = {name: Role(value) if name == "role" else value for name, value in mark.parameters.items()}
     try:
-        return None if kind is None else kind(**values)
-    except (TypeError, ValueError):  # recorded when this kind of step had other parameters
+        return step_of(mark.kind, mark.parameters)
+    except ConfigError:  # recorded when this kind of step had other parameters
         return None
 
 

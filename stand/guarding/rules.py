@@ -70,7 +70,7 @@ _DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
 class Announcements:
     """What rules need from the hub besides readings: subscribe `receive`.
 
-    is_capturing: a Capture has begun and not ended. frames_stopped: why the recorder takes no frames, "" while it does.
+    is_capturing: a capture has begun and not ended. frames_stopped: why the recorder takes no frames, "" while it does.
     is_paused: an operator has paused the run, or has not answered a prompt.
     """
 
@@ -85,7 +85,7 @@ class Announcements:
 
     def receive(self, item: Item) -> None:
         """The hub's subscriber."""
-        if isinstance(item, StepMark) and item.kind == Capture.__name__:
+        if isinstance(item, StepMark) and item.kind == Capture.kind:
             self.is_capturing = item.state is StepState.STARTED
         elif isinstance(item, Event) and item.kind in (FRAMES_STOPPED, FRAMES_RESUMED):
             self.frames_stopped = item.text if item.kind == FRAMES_STOPPED else ""

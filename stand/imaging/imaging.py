@@ -68,6 +68,15 @@ class Imaging:
             with self._motions.under_way("flap", "closing"):
                 await self._flap.move_closed()
 
+    async def power_camera(self, *, on: bool) -> None:
+        """Switch the supply as the plan has it: what is known of the camera's equilibrium counts no longer."""
+        self.supply.equilibrium.forget()
+        await (self.supply.switch_on() if on else self.supply.switch_off())
+
+    async def cool_down(self, band_K: float, time_constant_s: float, max_s: float) -> None:
+        """Wait until the camera, which is off, is as cold as the air."""
+        await self.supply.cool_down(band_K, time_constant_s, max_s)
+
     async def take_frame(
         self,
         exposure_s: float,

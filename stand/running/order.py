@@ -19,6 +19,7 @@ from stand.assembly import bus_units, inputs_of
 from stand.config.checked import ATTACHMENT, load_checked
 from stand.config.recipe import Recipe
 from stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
+from stand.estimating.durations import ConfiguredStand
 from stand.estimating.estimate import check_step, price
 
 _REGISTERS, _OPTICS = "registers-{}.yaml", "optics-{}.yaml"  # their names in a session
@@ -124,13 +125,13 @@ def check_plan(plan: Iterable[PlannedStep], config: StandConfig) -> None:
 
 def plan_faults(plan: Sequence[PlannedStep], config: StandConfig) -> Iterator[tuple[int, str]]:
     """(index, sentence) of each step that cannot be where it is, or is nothing for this stand."""
-    written = (Written((each.index,), each.step) for each in plan)
+    written, stand = (Written((each.index,), each.step) for each in plan), ConfiguredStand(config)
     for each, (_, fault) in zip(plan, faults(written), strict=True):
         if fault:
             yield each.index, f"step {each.index + 1}: {fault}"
             continue
         try:
-            check_step(each, config)
+            check_step(each, stand)
         except ConfigError as error:
             yield each.index, str(error)
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from experiments.steps import PlannedStep, Step, step_of
-from experiments.words import in_words
-from experiments.written import set_point_after
+from experiments.steps import STEPS, PlannedStep, Situation, Step, step_of
 from foundation.errors import ConfigError
 from stand.config.stand_config import StandConfig
 from stand.estimating.estimate import price
@@ -18,7 +16,6 @@ from stand.serving.desk import WrittenStep
 from stand.serving.plan_faults import PlanCheck, StepFault
 
 _SET_POINT = "chamber_degC"
-_LABELLED = ("Capture", "SoakUntilSettled")  # with the set-point that the steps before have given the chamber
 
 
 def steps_of(
@@ -26,19 +23,20 @@ def steps_of(
 ) -> Iterator[tuple[Step | ConfigError, float | None]]:
     """Each of the steps that are to follow the first `from_index` of the plan, or what is wrong with it; and the
     chamber's set-point there, None while it is stopped. Frames that are not said to be at one are at that."""
-    at_degC: float | None = None
+    found = Situation()
     for planned in plan[:from_index]:
-        at_degC = set_point_after(planned.step, at_degC)
+        found = planned.step.leaves(found)
     for written in steps:
-        here_degC, parameters = at_degC, dict[str, object](written.parameters)
-        if written.kind in _LABELLED and parameters.get(_SET_POINT) is None and at_degC is not None:
-            parameters[_SET_POINT] = at_degC
+        here_degC, parameters = found.set_point_degC, dict[str, object](written.parameters)
+        is_labelled = written.kind in STEPS and STEPS[written.kind].at_set_point
+        if is_labelled and parameters.get(_SET_POINT) is None and here_degC is not None:
+            parameters[_SET_POINT] = here_degC
         try:
             step = step_of(written.kind, parameters)
         except ConfigError as error:
             yield error, here_degC
         else:
-            at_degC = set_point_after(step, at_degC)
+            found = step.leaves(found)
             yield step, here_degC
 
 
@@ -46,7 +44,7 @@ def check_edit(state: RunState, from_index: int, steps: Sequence[WrittenStep], c
     """What an edit of the plan from `from_index` on would say. Changes nothing, and asks no device."""
     found = list(steps_of(state.plan, from_index, steps))
     seen = PlanCheck(
-        texts=tuple("" if isinstance(step, ConfigError) else in_words(step) for step, _ in found),
+        texts=tuple("" if isinstance(step, ConfigError) else step.words for step, _ in found),
         set_points_degC=tuple(degC for _, degC in found),
     )
     by = [step for step, _ in found if not isinstance(step, ConfigError)]

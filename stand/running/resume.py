@@ -182,7 +182,7 @@ def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Itera
 def _recorded_frames(session: Session) -> list[tuple[int, str]]:
     """Instant and step of the captures' frames that are on the disk with their descriptions; looks are none."""
     times_ns = set(session.frame_times_ns.tolist())
-    captures = {mark.step_id for mark in session.steps() if mark.kind == Capture.__name__}
+    captures = {mark.step_id for mark in session.steps() if mark.kind == Capture.kind}
     metas = ((time_ns, meta.step_id) for time_ns, meta in session.frame_metas if time_ns in times_ns)
     return [(time_ns, step_id) for time_ns, step_id in metas if step_id in captures]
 

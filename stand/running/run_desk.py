@@ -8,8 +8,7 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from experiments.steps import PlannedStep, Step, frames_of, kind_of, parameters_of
-from experiments.words import in_words
+from experiments.steps import PlannedStep, Step
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.errors import ConfigError, SessionError
 from foundation.events import PROMPT
@@ -245,14 +244,14 @@ class RunDesk:
     def _plan_step(self, state: RunState, planned: PlannedStep, ends_ns: Mapping[str, int]) -> PlanStep:
         step_id, step = planned.step_id, planned.step
         standing = _standing(state, step_id)
-        frames, is_to_come = frames_of(step), standing in ("waiting", "under_way")
+        frames, is_to_come = step.frame_count, standing in ("waiting", "under_way")
         earned_s = state.earned_ns.get(step_id, 0) / NS_PER_S
         return PlanStep.model_construct(
             step_id=step_id,
             index=planned.index,
-            kind=kind_of(step),
-            parameters=parameters_of(step),
-            text=in_words(step),
+            kind=step.kind,
+            parameters=step.parameters,
+            text=step.words,
             standing=standing,
             duration_s=self.eta.expected_s(step_id),
             earned_s=earned_s,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from experiments.words import doing_in_words, mark_in_words
+from experiments.steps import words_of
+from experiments.words import doing_in_words
 from foundation.clock import Clock, seconds_ns, utc_offset_ns
 from foundation.items import Batch, Event, Item, StepMark
 from foundation.readings import Quality
@@ -71,7 +72,7 @@ class StatusBoard:
             case StepMark():
                 self.eta.mark(item)
                 self._step = item.index + 1
-                self._doing = mark_in_words(item.kind, item.parameters)
+                self._doing = words_of(item.kind, item.parameters)
             case Event():
                 self.eta.event(item)
                 if item.level != "info":

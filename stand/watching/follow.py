@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-from experiments.words import doing_in_words, mark_in_words
+from experiments.steps import words_of
+from experiments.words import doing_in_words
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, CLOCK_STEP, RUN_BEGINS, TO_AMBIENT
 from foundation.items import Batch, Event, Item, Original, StepMark
@@ -74,7 +75,7 @@ class Follow:
                 self._readings(item)
             case StepMark():
                 self.eta.mark(item)
-                self._doing = mark_in_words(item.kind, item.parameters)
+                self._doing = words_of(item.kind, item.parameters)
                 self._moment = replace(self._moment, step=item.index + 1, steps=self.eta.count)
                 self._begin_ns = item.time_ns if self._begin_ns is None else self._begin_ns
                 self._next_ns = item.time_ns

@@ -22,7 +22,7 @@ from compensation.design.next_visit import Wanted, decide
 from compensation.drift.choosing import fit
 from experiments.known import Enough, Frames, Visit, after_decision, first_decision, fixed_visits
 from experiments.parameters import Known
-from experiments.steps import Capture, Decide, SetTemperature, Soak, Step, estimate_s
+from experiments.steps import Capture, Decide, SetTemperature, Soak, Step, usual_s
 from foundation.errors import SessionError
 from tests.bench.drift_drawn import Score, effects_of, score
 from tests.bench.figures import Figure, absolute, at_most, progress
@@ -159,7 +159,7 @@ def deciding_night(
                 continue
             case _:
                 pass
-        gone_s += estimate_s(step, 0.0)
+        gone_s += usual_s([step])
     made = night(camera, parts, seed)
     if as_good_s == np.inf and left_mpx(made, asked) <= fixed_mpx:
         as_good_s = gone_s

@@ -174,7 +174,7 @@ def _items(number: int, index: int, time_ns: int, begins: bool) -> Iterator[Item
     role, chamber_degC = SEQUENCE[index]
     if begins:
         parameters: dict[str, object] = {"role": role, "chamber_degC": chamber_degC}
-        yield StepMark(time_ns, f"step-{index}", index, "Capture", StepState.STARTED, parameters)
+        yield StepMark(time_ns, f"step-{index}", index, "capture", StepState.STARTED, parameters)
     yield Batch("thermometers", time_ns, (Reading("thermometers.air", chamber_degC, "degC", time_ns),))
     blank = np.zeros((1, 1), np.uint8)
     frame = Frame("camera.image", blank, time_ns, 0.1, 0.0, chamber_degC + 20, number, time_ns)

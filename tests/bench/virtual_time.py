@@ -68,7 +68,7 @@ def _soaked_per_second(order: Order, out: Path) -> float:
     soaks: list[tuple[float, float]] = []
 
     def follow(item: Item) -> None:
-        if isinstance(item, StepMark) and item.kind == "Soak":
+        if isinstance(item, StepMark) and item.kind == "soak":
             if item.state is StepState.STARTED:
                 begun_s[item.step_id] = time.perf_counter()
             elif item.state is StepState.DONE:

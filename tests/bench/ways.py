@@ -182,7 +182,7 @@ async def _run(directory: Path, trip: bool) -> None:
             os.kill(os.getpid(), signal.SIGINT)
 
     def receive(item: Item) -> None:
-        is_captured = isinstance(item, StepMark) and item.kind == "Capture" and item.state is StepState.DONE
+        is_captured = isinstance(item, StepMark) and item.kind == "capture" and item.state is StepState.DONE
         if is_captured and not ending:
             ending.append(asyncio.ensure_future(end()))
 

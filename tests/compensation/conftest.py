@@ -78,7 +78,7 @@ def published(index: int, time_ns: int, bits: int = 8) -> Iterator[Item]:
     if index < len(SEQUENCE) - 1:
         air = Reading("thermometers.air", chamber_degC + 0.1, "degC", time_ns)
         yield Batch("thermometers", time_ns, (air,))
-    yield StepMark(time_ns, f"step-{index}", index, "Capture", StepState.STARTED, parameters)
+    yield StepMark(time_ns, f"step-{index}", index, "capture", StepState.STARTED, parameters)
     yield Frame("camera.image", image, time_ns, 0.1, 0.0, chamber_degC + 20, index, 0, 0, f"step-{index}")
 
 

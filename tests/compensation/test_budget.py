@@ -175,7 +175,7 @@ def published(index: int, time_ns: int, started: bool) -> Iterator[Item]:
     readings = tuple(Reading(f"thermometers.{n}", getattr(state, f"{n}_degC"), "degC", time_ns) for n in names)
     yield Batch("thermometers", time_ns, readings)
     mark = StepState.STARTED if started else StepState.DONE
-    yield StepMark(time_ns, f"step-{index}", index, "Capture", mark, {"role": role, "chamber_degC": state.air_degC})
+    yield StepMark(time_ns, f"step-{index}", index, "capture", mark, {"role": role, "chamber_degC": state.air_degC})
     if started:
         shift_mm = REPEAT_px / 2 if role == "repeatability" else 0.0  # 2 px per mm
         scene = Scene(size=(640, 480), f_px=2000, diameter_mm=10, shift_mm=(shift_mm, 0.0))

@@ -77,14 +77,14 @@ async def publish_visit(hub: Hub, clock: VirtualClock, number: int, place: tuple
         move = f"move-{number}-{axis}"
         for state in (StepState.STARTED, StepState.DONE):
             parameters: dict[str, object] = {"axis": axis, "position": position}
-            hub.publish(StepMark(clock.now_ns(), move, 3 * number + index, "MoveTo", state, parameters))
+            hub.publish(StepMark(clock.now_ns(), move, 3 * number + index, "move_to", state, parameters))
             if state is StepState.STARTED:
                 publish_poll(hub, clock.now_ns(), axis, position - 20, moving=1.0)
             await clock.sleep_until(clock.now_ns() + NS_PER_S)
     publish_poll(hub, clock.now_ns(), "linear", place[0] + REPORTED_mm, moving=0.0)
     capture = f"capture-{number}"
     parameters = {"frames": 2, "role": role, "chamber_degC": 24.0}
-    hub.publish(StepMark(clock.now_ns(), capture, 3 * number + 2, "Capture", StepState.STARTED, parameters))
+    hub.publish(StepMark(clock.now_ns(), capture, 3 * number + 2, "capture", StepState.STARTED, parameters))
     scene = scene_at(place[0] + REPORTED_mm, place[1])
     clean = render(scene)
     for frame in range(2):
@@ -93,7 +93,7 @@ async def publish_visit(hub: Hub, clock: VirtualClock, number: int, place: tuple
         if number == DARK and frame == 1:
             image = np.full_like(image, 3)
         hub.publish(Frame("camera.image", image, clock.now_ns(), 0.1, 0.0, 40.0, 2 * number + frame, 0, 0, capture))
-    hub.publish(StepMark(clock.now_ns(), capture, 3 * number + 2, "Capture", StepState.DONE, parameters))
+    hub.publish(StepMark(clock.now_ns(), capture, 3 * number + 2, "capture", StepState.DONE, parameters))
 
 
 def publish_poll(hub: Hub, time_ns: int, axis: str, position: float, moving: float) -> None:

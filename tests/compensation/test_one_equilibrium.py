@@ -21,7 +21,7 @@ def items(gap_index: int, *, superseded: bool = False, role: str = "fit"):
 
     def at(time_ns, index):
         parameters = {"role": role, "chamber_degC": 24.0}
-        yield StepMark(time_ns, f"capture-{index}", index, "Capture", StepState.STARTED, parameters)
+        yield StepMark(time_ns, f"capture-{index}", index, "capture", StepState.STARTED, parameters)
         yield frame(time_ns - 50_000_000, index)
         if index == 11:
             if superseded:

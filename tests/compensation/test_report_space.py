@@ -81,9 +81,9 @@ def steps(moves: tuple[tuple[float, float], ...], role: str, prefix: str) -> lis
         for axis, position in zip(("linear", "rotary"), place, strict=True):
             move: dict[str, object] = {"axis": axis, "position": position}
             for state in (StepState.STARTED, StepState.DONE):
-                found.append(StepMark(number, f"{prefix}-move-{number}-{axis}", number, "MoveTo", state, move))
+                found.append(StepMark(number, f"{prefix}-move-{number}-{axis}", number, "move_to", state, move))
         found.append(
-            StepMark(number, f"{prefix}-capture-{number}", number, "Capture", StepState.STARTED, {"role": role})
+            StepMark(number, f"{prefix}-capture-{number}", number, "capture", StepState.STARTED, {"role": role})
         )
     return found
 

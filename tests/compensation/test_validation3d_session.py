@@ -63,7 +63,7 @@ def published(index: int, time_ns: int, silent: str) -> Iterator[Item]:
     for number, (axis, position) in enumerate(zip(("linear", "rotary"), place, strict=True)):
         for state in (StepState.STARTED, StepState.DONE):
             move: dict[str, object] = {"axis": axis, "position": position}
-            yield StepMark(time_ns, f"move-{index}-{axis}", 3 * index + number, "MoveTo", state, move)
+            yield StepMark(time_ns, f"move-{index}-{axis}", 3 * index + number, "move_to", state, move)
     above_K = chamber_degC - 24
     degC = {"granite_inside": 24 + GRANITE_K * (above_K > 0), "granite_outside": 24.0, "artifact": 24.0}
     degC |= {"air": 24.0, "laboratory": 24.0}
@@ -75,11 +75,11 @@ def published(index: int, time_ns: int, silent: str) -> Iterator[Item]:
     yield Batch("thermometers", time_ns, readings)
     step, role = f"capture-{index}", "repeatability" if index % 3 == 2 else "pose"
     capture: dict[str, object] = {"frames": 1, "role": role, "chamber_degC": chamber_degC}
-    yield StepMark(time_ns, step, 3 * index + 2, "Capture", StepState.STARTED, capture)
+    yield StepMark(time_ns, step, 3 * index + 2, "capture", StepState.STARTED, capture)
     scene = scene_at(place, above_K)
     image = photograph(scene, render(scene), index)
     yield Frame("camera.image", image, time_ns, 0.1, 0.0, chamber_degC + 15, index, 0, 0, step)
-    yield StepMark(time_ns, step, 3 * index + 2, "Capture", StepState.DONE, capture)
+    yield StepMark(time_ns, step, 3 * index + 2, "capture", StepState.DONE, capture)
 
 
 async def record(directory: Path, visits: int = len(VISITS), silent: str = "") -> None:

@@ -6,18 +6,18 @@ from pydantic import ValidationError
 from experiments.steps import (
     Capture,
     CloseFlap,
+    KnownStand,
     OpenFlap,
     PowerCamera,
     Role,
     SetTemperature,
+    Situation,
     Soak,
     SoakUntilSettled,
     StartChamber,
     StopChamber,
-    estimate_s,
-    is_setup,
-    longest_s,
     number_steps,
+    usual_s,
 )
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from experiments.validation import Validation, validation
@@ -70,8 +70,8 @@ def test_a_dwell_until_settled_takes_the_place_of_the_fixed_one_at_its_set_point
     adaptive = list(thermal_cycle(ThermalCycle.model_validate({**cycle, "until": "settled"})))
     assert adaptive == [UNTIL_SETTLED if step == Soak(2700.0) else step for step in fixed]
     assert adaptive.count(UNTIL_SETTLED) == 1
-    assert not is_setup(UNTIL_SETTLED)
-    assert longest_s(UNTIL_SETTLED) == 2700.0
+    assert not UNTIL_SETTLED.is_setup
+    assert UNTIL_SETTLED.longest_s == 2700.0
 
 
 def test_a_validation_waits_for_the_camera_too():
@@ -118,7 +118,7 @@ def test_ids_follow_place_and_parameters():
 
 
 def test_a_capture_lasts_from_its_first_to_its_last_frame():
-    assert estimate_s(Capture(5, 0.5, 0.1, Role.FIT, 24.0), 8.0) == pytest.approx(2.1)
+    assert usual_s([Capture(5, 0.5, 0.1, Role.FIT, 24.0)]) == pytest.approx(2.1)
 
 
 @pytest.mark.parametrize(
@@ -159,8 +159,9 @@ def test_an_impossible_warm_up_is_refused_with_a_reason(change: dict[str, object
 
 
 def test_switching_the_camera_on_takes_its_own_boot_time():
-    assert estimate_s(PowerCamera(on=True), 4.0) == 4.0
-    assert estimate_s(PowerCamera(on=False), 4.0) == 0.0
+    stand = KnownStand()
+    stand.boot_s = 4.0
+    assert [PowerCamera(on).price(Situation(), stand).duration_s for on in (True, False)] == [4.0, 0.0]
 
 
 def test_the_longest_recipe_is_planned_and_a_longer_one_refused():

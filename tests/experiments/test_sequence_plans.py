@@ -22,8 +22,7 @@ from experiments.steps import (
     StartChamber,
     Step,
     StopChamber,
-    estimate_s,
-    is_setup,
+    usual_s,
 )
 from experiments.validation import Validation, validation
 from experiments.warm_up import WarmUp, warm_up
@@ -172,13 +171,13 @@ def test_set_up_is_restored_after_an_interruption_and_work_is_done_once():
         CheckHome("linear"),
         Prompt("roll the camera"),
     ]
-    assert [is_setup(step) for step in (*set_up, *work)] == [True] * len(set_up) + [False] * len(work)
+    assert [step.is_setup for step in (*set_up, *work)] == [True] * len(set_up) + [False] * len(work)
 
 
 def test_a_cool_down_lasts_until_20_K_have_decayed_to_the_band_or_its_limit_is_reached():
-    assert estimate_s(CoolDown(0.5, 1200.0, 7200.0), 8.0) == pytest.approx(4426.7, abs=0.1)
-    assert estimate_s(CoolDown(0.5, 1200.0, 3600.0), 8.0) == 3600.0
-    assert estimate_s(CoolDown(20.0, 1200.0, 3600.0), 8.0) == 0.0
+    assert usual_s([CoolDown(0.5, 1200.0, 7200.0)]) == pytest.approx(4426.7, abs=0.1)
+    assert usual_s([CoolDown(0.5, 1200.0, 3600.0)]) == 3600.0
+    assert usual_s([CoolDown(20.0, 1200.0, 3600.0)]) == 0.0
 
 
 def test_each_kind_of_entry_plans_its_own_steps():

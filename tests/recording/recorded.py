@@ -48,11 +48,11 @@ def half_second(time_ns, index, dtype: Any = np.uint8):
     artifact = Reading("thermometers.artifact", 0.1 + 0.2, "degC", time_ns - MS, Quality.STALE, "not confirmed")
     yield Batch("thermometers", time_ns, (air, artifact))
     yield Batch("regulator", time_ns, (Reading("regulator.pv", 21.0 + index, "degC", time_ns),))
-    yield StepMark(time_ns, f"capture-{index}", index, "Capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5})
+    yield StepMark(time_ns, f"capture-{index}", index, "capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5})
     yield Batch("linear", time_ns, (Reading("linear.position", 100.0 + index, "mm", time_ns),))
     yield Batch("rotary", time_ns, (Reading("rotary.position", 1e-17 * index, "deg", time_ns),))
     yield frame(time_ns - 50 * MS, index, dtype)
-    yield StepMark(time_ns, f"capture-{index}", index, "Capture", StepState.DONE, {"frames": 1, "interval_s": 0.5})
+    yield StepMark(time_ns, f"capture-{index}", index, "capture", StepState.DONE, {"frames": 1, "interval_s": 0.5})
     yield Event(time_ns, "warning", "note", f"half second {index}, 5 µm")
 
 

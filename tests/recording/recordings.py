@@ -57,7 +57,7 @@ def one_second(time_ns, index):
     yield batch("linear", time_ns, position=100.0 + index, moving=0.0, homed=1.0)
     yield batch("rotary", time_ns, position=30.0, moving=0.0, homed=1.0)
     yield batch("flap", time_ns, position=1.0, current=35.0)
-    yield StepMark(time_ns, f"step-{index}", index, "Capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5})
+    yield StepMark(time_ns, f"step-{index}", index, "capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5})
     yield frame(time_ns, index)
     yield Event(time_ns, "info", "note", f"second {index}")
 

@@ -29,7 +29,7 @@ def items(time_ns: int, index: int):
         (Reading("linear.position", 100 + 2 * share, "mm", time_ns), Reading("linear.moving", 1.0, "1", time_ns)),
     )
     parameters: dict[str, object] = {"frames": 1, "role": "fit", "chamber_degC": 20 + index}
-    yield StepMark(time_ns, f"capture-{index}", index, "Capture", StepState.STARTED, parameters if index else {})
+    yield StepMark(time_ns, f"capture-{index}", index, "capture", StepState.STARTED, parameters if index else {})
     yield frame(time_ns - 50 * MS, index)
 
 

@@ -125,7 +125,7 @@ def test_one_instant_shared_by_a_batch_costs_no_remarks():
     st.sampled_from(StepState),
 )
 def test_a_step_survives_the_round_trip(parameters, state):
-    mark = StepMark(TIME_NS, "cycle-1/soak-30", 17, "Soak", state, parameters)
+    mark = StepMark(TIME_NS, "cycle-1/soak-30", 17, "soak", state, parameters)
     assert messages.decode_step(messages.encode_step(mark), TIME_NS) == mark
 
 

@@ -35,11 +35,11 @@ def second(time_ns, index):
     yield Batch("camera", time_ns, (camera,))
     yield Batch("linear", time_ns, (Reading("linear.position", 1.0, "mm", time_ns),))
     marks = {
-        0: ("soak", 3, "Soak", StepState.STARTED, {"duration_s": 2.0}),
-        2: ("soak", 3, "Soak", StepState.DONE, {"duration_s": 2.0}),
-        3: ("capture", 4, "Capture", StepState.STARTED, CAPTURE),
-        8: ("capture", 4, "Capture", StepState.FAILED, CAPTURE),
-        9: ("flap", 5, "CloseFlap", StepState.STARTED, {}),
+        0: ("soak", 3, "soak", StepState.STARTED, {"duration_s": 2.0}),
+        2: ("soak", 3, "soak", StepState.DONE, {"duration_s": 2.0}),
+        3: ("capture", 4, "capture", StepState.STARTED, CAPTURE),
+        8: ("capture", 4, "capture", StepState.FAILED, CAPTURE),
+        9: ("flap", 5, "close_flap", StepState.STARTED, {}),
     }
     if index in marks:
         yield StepMark(time_ns, *marks[index])
@@ -71,9 +71,9 @@ async def test_a_glance_tells_what_when_and_how_much(session):
 async def test_the_overview_has_the_steps_as_they_went(session):
     steps = overview(session).steps
     assert [(step.index, step.kind, str(step.state), step.frames) for step in steps] == [
-        (3, "Soak", "done", 0),
-        (4, "Capture", "failed", 5),
-        (5, "CloseFlap", "started", 0),
+        (3, "soak", "done", 0),
+        (4, "capture", "failed", 5),
+        (5, "close_flap", "started", 0),
     ]
     assert [step.begin_ns - START_NS for step in steps] == [0, 3 * NS_PER_S, 9 * NS_PER_S]
     assert [step.end_ns and step.end_ns - START_NS for step in steps] == [2 * NS_PER_S, 8 * NS_PER_S, None]

@@ -39,7 +39,7 @@ async def test_what_was_published_is_read_back(tmp_path):
     assert np.isnan(session.readings("thermometers.artifact")[1]).tolist() == [False, False, False, True, False]
     assert session.readings("linear.position")[1].tolist() == [100.0, 101.0, 102.0, 103.0, 104.0]
     assert session.steps()[2] == StepMark(
-        int(times_ns[2]), "step-2", 2, "Capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5}
+        int(times_ns[2]), "step-2", 2, "capture", StepState.STARTED, {"frames": 1, "interval_s": 0.5}
     )
     assert [event.text for event in session.events()] == [f"second {k}" for k in range(5)]
     assert session.frame_count == 5

@@ -32,7 +32,7 @@ def second(time_ns, index):
     yield Batch("regulator", time_ns, (Reading("regulator.pv", 20.0 + index, "degC", time_ns),))
     state = {0: StepState.STARTED, SECONDS - 1: StepState.DONE}.get(index)
     if state is not None:
-        yield StepMark(time_ns, "capture", 4, "Capture", state, {"frames": SECONDS})
+        yield StepMark(time_ns, "capture", 4, "capture", state, {"frames": SECONDS})
     yield frame(time_ns, index)
     yield Event(time_ns, "info", "note", f"second {index}")
 
@@ -313,7 +313,7 @@ async def test_losses_the_recording_tells_of_are_notes(tmp_path):
 
     directory = await recorded(tmp_path / "s", items)
     assert errors(directory) == []
-    assert notes(directory) == ["note: 2 frames of step 5 (Capture) lost by the camera or its wire"]
+    assert notes(directory) == ["note: 2 frames of step 5 (capture) lost by the camera or its wire"]
 
 
 async def test_frames_the_recorder_says_it_lost_are_notes(tmp_path):

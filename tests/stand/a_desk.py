@@ -110,7 +110,7 @@ class ADesk:
         )
 
     def plan(self) -> tuple[PlanStep, ...]:
-        step = {"kind": "Soak", "parameters": {"duration_s": 60.0}, "text": "Soak", "duration_s": 60.0}
+        step = {"kind": "soak", "parameters": {"duration_s": 60.0}, "text": "soak", "duration_s": 60.0}
         return (PlanStep.model_validate({"step_id": "0-soak", "index": 0, "standing": "waiting", **step}),)
 
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from experiments.steps import (
     Capture,
     CloseFlap,
+    KnownStand,
     OpenFlap,
     PowerCamera,
     SetTemperature,
+    Situation,
     SoakUntilSettled,
     StartChamber,
     Step,
     StopChamber,
-    estimate_s,
 )
 from foundation.documents import load_document
 from stand.config.recipe import Recipe
@@ -59,7 +60,9 @@ class Player:
                 interruptions += 1
 
     def _perform(self, step: Step) -> Iterator[tuple[float, Action]]:
-        duration_s = estimate_s(step, BOOT_S)
+        stand = KnownStand()
+        stand.boot_s = BOOT_S
+        duration_s = step.price(Situation(flap_open=isinstance(step, CloseFlap)), stand).duration_s
         match step:
             case StartChamber(degC):
                 self.set_point_degC = degC

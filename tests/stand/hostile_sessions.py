@@ -191,7 +191,7 @@ def reported(*events: tuple[str, bytes]) -> Callable[[Path], None]:
 
 
 def step(parameters_json: str, **fields: object) -> tuple[str, bytes]:
-    known = {"step_id": "x", "index": 3, "kind": "Soak", "state": "started"} | fields
+    known = {"step_id": "x", "index": 3, "kind": "soak", "state": "started"} | fields
     made = messages.CLASSES[messages.STEP](parameters_json=parameters_json, **known)
     return messages.STEP, made.SerializeToString()
 

@@ -97,7 +97,7 @@ class NightDesk(ADesk):
             recipe="overnight",
             step=32,
             steps=STEPS,
-            doing=f"Soak at {set_point_degC(self.now_s()):g} °C",
+            doing=f"soak at {set_point_degC(self.now_s()):g} °C",
             state="held" if reasons else "running",
             reasons=reasons,
             now_ns=now_ns,
@@ -135,8 +135,8 @@ class NightDesk(ADesk):
         return tuple(self._step(index) for index in range(STEPS))
 
     def _step(self, index: int) -> PlanStep:
-        kinds = (("StartChamber", "set {:g} °C", 2.0), ("Soak", "soak 55 min at {:g} °C", 3300.0))
-        kind, text, duration_s = (*kinds, ("Capture", "5 frames at {:g} °C", 298.0))[index % 3]
+        kinds = (("start_chamber", "set {:g} °C", 2.0), ("soak", "soak 55 min at {:g} °C", 3300.0))
+        kind, text, duration_s = (*kinds, ("capture", "5 frames at {:g} °C", 298.0))[index % 3]
         degC: dict[str, JsonValue] = {"chamber_degC": SET_POINTS[index // 3]}
         soak: dict[str, JsonValue] = {"duration_s": duration_s}
         frames: dict[str, JsonValue] = {"frames": 5, "interval_s": 60.0, "exposure_s": 0.1, "role": "other", **degC}
@@ -152,9 +152,9 @@ class NightDesk(ADesk):
             text=text.format(SET_POINTS[index // 3]),
             standing=standing,
             duration_s=duration_s,
-            earned_s=max(0.0, min(duration_s, now_s - begin_s)) if kind == "Soak" and begun else 0.0,
-            frames=5 if kind == "Capture" else 0,
-            frames_saved=5 if kind == "Capture" and ended else 0,
+            earned_s=max(0.0, min(duration_s, now_s - begin_s)) if kind == "soak" and begun else 0.0,
+            frames=5 if kind == "capture" else 0,
+            frames_saved=5 if kind == "capture" and ended else 0,
             began_ns=self._at(begin_s) if begun else None,
             ended_ns=self._at(end_s) if ended else None,
             expected_ns=None if ended else self._at(end_s),

@@ -36,7 +36,7 @@ async def take(folder: Path) -> None:
                             await page.get_by_role("button", name="12 h").click()
                             await page.get_by_text("markers found").wait_for()
                         if view == "plan":
-                            await page.get_by_text("Soak").first.wait_for()
+                            await page.get_by_text("soak").first.wait_for()
                         await page.wait_for_timeout(2000)
                         await page.screenshot(path=folder / f"{name}.png")
                 desk.trip()

@@ -7,9 +7,7 @@ from experiments.steps import (
     PlannedStep,
     Role,
     Step,
-    kind_of,
     number_steps,
-    parameters_of,
 )
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.items import StepMark, StepState
@@ -28,7 +26,7 @@ def marks(plan: Iterable[PlannedStep], durations_s: Iterable[float]) -> list[Ste
     now_ns = BEGIN_NS
     for item, duration_s in zip(plan, durations_s, strict=True):
         for state in (StepState.STARTED, StepState.DONE):
-            parameters = parameters_of(item.step)
-            found.append(StepMark(now_ns, item.step_id, item.index, kind_of(item.step), state, parameters))
+            parameters = item.step.parameters
+            found.append(StepMark(now_ns, item.step_id, item.index, item.step.kind, state, parameters))
             now_ns += seconds_ns(duration_s) if state is StepState.STARTED else 0
     return found

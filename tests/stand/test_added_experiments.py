@@ -105,8 +105,8 @@ HEAD = "from pydantic import BaseModel\nfrom experiments.steps import *\nclass P
             "acme 1.0 makes no steps of these (ZeroDivisionError: division by zero)",
         ),
         (f"{HEAD}def own(p: P): yield 'soak'", "step 1 is no step of experiments.steps but str; correct the package"),
-        (f"{HEAD}def own(p: P): yield Soak(float('nan'))", "step 1 (Soak) has duration_s nan"),
-        (f"{HEAD}def own(p: P): yield Soak(-1.0)", "step 1 (Soak) has duration_s -1.0"),
+        (f"{HEAD}def own(p: P): yield Soak(float('nan'))", "step 1 (soak) has duration_s nan"),
+        (f"{HEAD}def own(p: P): yield Soak(-1.0)", "step 1 (soak) has duration_s -1.0"),
         (f"{HEAD}def own(p: P): yield SetTemperature(30.0)", "experiments.1.own: the chamber is stopped here"),
         (
             f"{HEAD}def own(p: P):\n    while True: yield OpenFlap()",

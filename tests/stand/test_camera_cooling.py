@@ -7,7 +7,7 @@ from contextlib import suppress
 import pytest
 
 from drivers.sim.physics.plant import Plant, PlantSpec
-from experiments.steps import CoolDown, estimate_s
+from experiments.steps import CoolDown
 from experiments.warm_up import WarmUp
 from foundation.clock import VirtualClock, seconds_ns
 from foundation.hub import Hub
@@ -73,7 +73,7 @@ async def test_when_the_wait_is_over_every_part_of_the_camera_is_within_the_band
     assert room.excess_K > 15.0
     await cool_down(cooling, BAND_K, TIME_CONSTANT_S, 7200.0, room.hub, room.clock)
     assert 0.0 <= room.excess_K < BAND_K
-    assert room.waited_s == pytest.approx(estimate_s(CoolDown(BAND_K, TIME_CONSTANT_S, 7200.0), 8.0), rel=0.05)
+    assert room.waited_s == pytest.approx(CoolDown(BAND_K, TIME_CONSTANT_S, 7200.0).needed_s, rel=0.05)
     assert [event.kind for event in room.events] == ["cooled_down"]
 
 

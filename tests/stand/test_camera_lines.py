@@ -7,7 +7,7 @@ import yaml
 
 from drivers.devices.cameras.camera_gige import Camera
 from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
-from experiments.steps import Capture, parameters_of
+from experiments.steps import Capture
 from foundation.clock import WallClock
 from foundation.documents import parse_document
 from foundation.errors import ConfigError
@@ -92,7 +92,7 @@ def test_a_capture_may_name_its_cameras_which_the_stand_has_to_have():
     plan = parse_document(CAPTURE_OF.format(name="left"), Recipe, "recipe").plan()
     captures = [each.planned.step for each in price(plan, of(3)) if isinstance(each.planned.step, Capture)]
     assert [capture.cameras for capture in captures] == [("left",)]
-    assert parameters_of(captures[0])["cameras"] == ("left",)
-    assert "cameras" not in parameters_of(replace(captures[0], cameras=()))  # the plans of before keep their step ids
+    assert captures[0].parameters["cameras"] == ("left",)
+    assert "cameras" not in replace(captures[0], cameras=()).parameters
     with pytest.raises(ConfigError, match="this stand has no camera top; it has camera, left, right"):
         price(parse_document(CAPTURE_OF.format(name="top"), Recipe, "recipe").plan(), of(3))

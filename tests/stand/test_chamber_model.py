@@ -57,7 +57,7 @@ async def recorded(directory: Path) -> Session:
         if into_s == 0:
             parameters: dict[str, object] = {"chamber_degC": SET_POINTS_degC[dwell]}
             for state in (StepState.STARTED, StepState.DONE):
-                yield StepMark(time_ns, f"step-{dwell}", 2 * dwell, "SetTemperature", state, parameters)
+                yield StepMark(time_ns, f"step-{dwell}", 2 * dwell, "set_temperature", state, parameters)
 
     count = len(SET_POINTS_degC) * DWELL_S // POLL_S
     await record(directory, count, items, segment_s=1e6, period_ns=POLL_S * NS_PER_S)

@@ -33,7 +33,7 @@ STATUS = RunStatus(
     recipe="thermal-cycle",
     step=12,
     steps=87,
-    doing="Soak duration_s=2700",
+    doing="soak duration_s=2700",
     state="held",
     reasons=("disk_low", "operator"),
     now_ns=1_767_290_400_000_000_000,
@@ -66,7 +66,7 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
         f"session       {path}",
         "recipe        thermal-cycle",
         "state         held: disk_low, operator, since 2026-01-01 17:59:00 UTC (0:01:00)",
-        "step          12/87 Soak duration_s=2700",
+        "step          12/87 soak duration_s=2700",
         "ends          2026-01-01 19:00:00 UTC (in 1:00:00)",
         "temperatures  thermometers.air 23.98 degC",
         "temperatures  camera.temperature BAD",
@@ -167,7 +167,7 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
 async def test_the_plan_and_what_happens_are_shown(tmp_path: Path):
     path = session(tmp_path, "night")
     async with served(ADesk(run=STATUS), path):
-        assert (await invoke("status", path, "--plan")).stdout == "    1  waiting     Soak\n"
+        assert (await invoke("status", path, "--plan")).stdout == "    1  waiting     soak\n"
 
 
 @pytest.mark.parametrize(("moving", "said"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "nothing")])

@@ -53,7 +53,7 @@ def words_everywhere(session: Path, status: int) -> tuple[str, str]:
 
 def test_a_complete_run_is_sound_everywhere(session: Path):
     assert words_everywhere(session, 0) == ("complete", "sound")
-    assert "steps 20 of 20 done: 20 Capture" in " ".join(ask("info", session).stdout.split())
+    assert "steps 20 of 20 done: 20 capture" in " ".join(ask("info", session).stdout.split())
 
 
 @pytest.mark.parametrize("status", ["stopped", "tripped", "failed"])
@@ -66,8 +66,8 @@ def test_steps_are_counted_when_they_are_done_and_against_the_plan(tmp_path: Pat
     asyncio.run(record_run(tmp_path / "s", items=half_done, status=""))
     write_journal(tmp_path / "s", *entries(SECONDS // 2, "stopped"))
     said = " ".join(ask("info", tmp_path / "s").stdout.split())
-    assert "steps 10 of 20 done: 10 Capture" in said
-    assert "not done 10 Capture frames=1 interval_s=0.5 has no end in the recording" in said
+    assert "steps 10 of 20 done: 10 capture" in said
+    assert "not done 10 capture frames=1 interval_s=0.5 has no end in the recording" in said
 
 
 def test_segments_deleted_from_the_end_make_a_complete_run_incomplete(session: Path):

@@ -12,7 +12,7 @@ import pytest
 
 from experiments.known import Enough, Undecided, Visit, after_decision, fixed_visits
 from experiments.parameters import Known
-from experiments.steps import Capture, Decide, PlannedStep, Role, SetTemperature, Soak, Step, estimate_s, number_steps
+from experiments.steps import Capture, Decide, PlannedStep, Role, SetTemperature, Soak, Step, number_steps, usual_s
 from experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from foundation.clock import NS_PER_S, WallClock
 from foundation.items import Event
@@ -152,7 +152,7 @@ async def test_a_late_decision_is_not_waited_for(tmp_path: Path):
 
 
 def total_s(steps: tuple[Step, ...]) -> float:
-    return sum(estimate_s(step, 0.0) for step in steps if not isinstance(step, Decide))
+    return usual_s(step for step in steps if not isinstance(step, Decide))
 
 
 @pytest.mark.parametrize("answer", [Visit(47.0, 120.0), Visit(11.0, 60.0), Undecided()])

@@ -14,6 +14,7 @@ from experiments.steps import (
     OpenFlap,
     PowerCamera,
     SetTemperature,
+    Situation,
     Soak,
     SoakUntilSettled,
     StartChamber,
@@ -25,7 +26,7 @@ from foundation.errors import ConfigError
 from foundation.items import Event
 from stand.config.stand_config import StandConfig, load_config, packaged
 from stand.estimating.chamber_model import ChamberModel, Response
-from stand.estimating.durations import Situation, expect, move_s
+from stand.estimating.durations import ConfiguredStand, expect, move_s
 from stand.estimating.estimate import price, way_back_s
 from stand.estimating.eta import Eta
 from stand.estimating.learned import Learned
@@ -72,7 +73,7 @@ def test_a_flap_that_is_closed_already_takes_no_travel(config: StandConfig):
 
 
 def test_what_was_learned_replaces_what_is_usual(config: StandConfig):
-    learned = Learned(overheads_s={"flap travel": 1.1, "PowerCamera": 2.5, "Capture": -5.0})
+    learned = Learned(overheads_s={"flap travel": 1.1, "power_camera": 2.5, "capture": -5.0})
     plan = planned(OpenFlap(), PowerCamera(on=True), CAPTURE, Soak(60.0))
     durations_s = [step.duration_s for step in price(plan, config, learned)]
     assert durations_s == pytest.approx([1.1, config.cameras["camera"].boot_s + 2.5, 0.0, 60.0])
@@ -216,9 +217,9 @@ def test_an_axis_that_the_stand_lacks_is_refused(config: StandConfig, step: Step
 
 
 def test_a_situation_is_what_the_steps_before_have_left(config: StandConfig):
-    found = Situation().after(MoveTo("linear", 3.0)).after(OpenFlap())
+    found = OpenFlap().leaves(MoveTo("linear", 3.0).leaves(Situation()))
     assert found == Situation(flap_open=True, positions={"linear": 3.0})
-    assert expect(OpenFlap(), found, config).work == "flap at rest"
+    assert expect(OpenFlap(), found, ConfiguredStand(config)).work == "flap at rest"
 
 
 def test_the_way_back_to_the_laboratory_is_part_of_the_night(config: StandConfig):

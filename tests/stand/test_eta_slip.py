@@ -19,7 +19,7 @@ class Night:
         return self.now_s * NS_PER_S
 
     def mark(self):
-        self.hub.publish(StepMark(self.now_ns(), "a", 0, "Soak", StepState.DONE))
+        self.hub.publish(StepMark(self.now_ns(), "a", 0, "soak", StepState.DONE))
 
 
 def test_each_tenth_is_reported_once():

@@ -98,7 +98,7 @@ def test_a_capture_that_was_held_shortly_is_taken_again_only_if_making_ready_tak
 ):
     """The chamber has left its band meanwhile: its soak is soaked again, in which no frame is taken."""
     here = begun(follows=False)
-    here.passes_until("Capture", 22.0)
+    here.passes_until("capture", 22.0)
     before = here.frames()
     here.life.interlock()
     here.life.publish_pv(chamber_degC)
@@ -112,7 +112,7 @@ def test_a_capture_that_was_held_shortly_is_taken_again_only_if_making_ready_tak
     assert here.kinds("soak_restarted", "soak_credited") == ["soak_restarted" if is_restarted else "soak_credited"]
     assert [(event.data["step_id"], event.data["frames"]) for event in restarted] == [(ID[3], before)] * is_restarted
     assert here.frames() == CAPTURE.frames + before * is_restarted
-    assert here.became("Capture") == ["started", "done"]
+    assert here.became("capture") == ["started", "done"]
 
 
 def test_a_device_error_of_a_step_that_the_guard_holds_for_is_met_once_and_the_step_done_again(
@@ -127,7 +127,7 @@ def test_a_device_error_of_a_step_that_the_guard_holds_for_is_met_once_and_the_s
         lives[0].life.stand.safety.demand()
 
     lives.append(here := begun(meet=meet))
-    here.passes_until("OpenFlap", 0.0)
+    here.passes_until("open_flap", 0.0)
     here.life.stand.broken = True
     here.life.passes(20.0)
     assert [type(error) for error in met] == [Unreachable]
@@ -147,19 +147,21 @@ def test_work_of_a_step_that_fails_ends_an_unguarded_run_and_the_step_has_failed
         raise Unreachable("camera", "no answer")
 
     here.life.stand.cool_down = fails
-    here.passes_until("CoolDown", 5.0)
-    assert here.became("CoolDown") == ["started", "failed"]
+    here.passes_until("cool_down", 5.0)
+    assert here.became("cool_down") == ["started", "failed"]
     assert here.life.run.done()
     assert isinstance(here.life.run.exception(), Unreachable)
 
 
 def test_a_set_point_is_set_and_a_camera_that_was_off_is_waited_for(begun: Callable[..., Here]):
     here = begun()
-    here.passes_until("Capture", 12.0)
+    here.passes_until("capture", 12.0)
     here.life.call(here.life.stand.drop_supply)
     here.life.passes(600.0)
-    assert here.became("Capture") == ["started", "done"]
-    begun_ns = next(item.time_ns for item in here.items if isinstance(item, StepMark) and item.kind == "SetTemperature")
+    assert here.became("capture") == ["started", "done"]
+    begun_ns = next(
+        item.time_ns for item in here.items if isinstance(item, StepMark) and item.kind == "set_temperature"
+    )
     assert 0 <= here.life.stand.set_ns - begun_ns <= 2 * NS_PER_S
 
 

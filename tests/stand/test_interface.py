@@ -22,7 +22,7 @@ STATUS = RunStatus(
     recipe="thermal-cycle",
     step=12,
     steps=87,
-    doing="Soak duration_s=2700",
+    doing="soak duration_s=2700",
     state="running",
     reasons=(),
     now_ns=1_000_000_000_000,

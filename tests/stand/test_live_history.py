@@ -139,11 +139,11 @@ def test_marks_survive_many_others_of_less_weight():
 
 def test_a_step_is_a_mark_with_two_ends():
     history = History()
-    history(StepMark(T0, "a1", 0, "Capture", StepState.STARTED, {"role": "fit"}))
+    history(StepMark(T0, "a1", 0, "capture", StepState.STARTED, {"role": "fit"}))
     assert history.columns(T0 + 5, T0 + 10).marks[0].end_ns is None  # it began before and is under way
-    history(StepMark(T0 + 7, "a1", 0, "Capture", StepState.DONE, {"role": "fit"}))
+    history(StepMark(T0 + 7, "a1", 0, "capture", StepState.DONE, {"role": "fit"}))
     (mark,) = history.columns(T0 + 5, T0 + 10).marks
-    assert (mark.level, mark.kind, mark.text, mark.step_id, mark.end_ns) == ("step", "Capture", "fit", "a1", T0 + 7)
+    assert (mark.level, mark.kind, mark.text, mark.step_id, mark.end_ns) == ("step", "capture", "fit", "a1", T0 + 7)
     assert history.columns(T0 + 8, T0 + 10).marks == ()
 
 

@@ -126,9 +126,9 @@ async def test_the_drift_of_two_references_is_no_one_line(night):
     history = night.viewing.history
     async with a_page(night.chromium, night.port) as page:
         for moved_px in (0.0, 0.3):
-            night.hub.publish(StepMark(0, "r", 0, "Capture", StepState.STARTED, {"role": "reference"}))
+            night.hub.publish(StepMark(0, "r", 0, "capture", StepState.STARTED, {"role": "reference"}))
             night.hub.publish(frame_of(target_image(moved_px, 0), night.clock.now_ns(), "r"))
-            night.hub.publish(StepMark(0, "f", 0, "Capture", StepState.STARTED, {"role": "fit"}))
+            night.hub.publish(StepMark(0, "f", 0, "capture", StepState.STARTED, {"role": "fit"}))
             await until_looked_at(night, "reference")
             night.hub.publish(frame_of(target_image(moved_px + 0.5, 0), night.clock.now_ns(), "f"))
             await until_looked_at(night, "fit")

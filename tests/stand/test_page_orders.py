@@ -181,7 +181,7 @@ async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night
         await rows.nth(1).get_by_label("duration, s").fill("600")
         await rows.nth(1).get_by_text("soak for 10 min").wait_for()
         await editor.get_by_role("button", name="Later: step 34").click()
-        await editor.get_by_label("Kind of step to add").select_option("Prompt")
+        await editor.get_by_label("Kind of step to add").select_option("prompt")
         await editor.get_by_role("button", name="Add this step").click()
         await editor.get_by_role("button", name="Use these steps").click()
         await rows.nth(4).get_by_text("text: ").wait_for()
@@ -191,7 +191,7 @@ async def test_the_steps_to_come_are_edited_in_rows_that_say_what_is_wrong(night
         await editor.wait_for(state="detached")
         assert night.orders[-1][2] == {"from_index": 32, "steps": 5}
         assert "chamber_degC" not in night.edited[3].parameters
-        assert [step.kind for step in night.edited] == ["StartChamber", "Soak", "Soak", "Capture", "Prompt"]
+        assert [step.kind for step in night.edited] == ["start_chamber", "soak", "soak", "capture", "prompt"]
 
 
 async def test_a_recipe_is_changed_in_its_form_and_queued_once(night):

@@ -159,9 +159,9 @@ async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
     def items(time_ns, index):
         yield from (item for item in half_second(time_ns, index) if isinstance(item, Batch))
         parameters = {"frames": 1, "interval_s": 0.5, "role": "reference" if not index else "fit"}
-        yield StepMark(time_ns, f"c{index}", index, "Capture", StepState.STARTED, parameters)
+        yield StepMark(time_ns, f"c{index}", index, "capture", StepState.STARTED, parameters)
         yield frame_of(target_image(0, 0.2 * index, (612, 512)), time_ns, f"c{index}")
-        yield StepMark(time_ns, f"c{index}", index, "Capture", StepState.DONE, parameters)
+        yield StepMark(time_ns, f"c{index}", index, "capture", StepState.DONE, parameters)
 
     await record(night.folder / "night", 9, items, attachments={"target.yaml": TARGET})
     status, _, data = await ask(night, "/api/v1/sessions/night/drift")

@@ -23,9 +23,7 @@ from experiments.steps import (
     SoakUntilSettled,
     StartChamber,
     StopChamber,
-    kind_of,
     number_steps,
-    parameters_of,
     step_of,
 )
 from foundation.clock import NS_PER_S
@@ -94,7 +92,7 @@ def marks(life: Life) -> list[str]:
 
 
 def soaked_s(life: Life) -> float:
-    begun, ended = (m.time_ns for m in life.reported if isinstance(m, StepMark) and m.kind == "Soak")
+    begun, ended = (m.time_ns for m in life.reported if isinstance(m, StepMark) and m.kind == "soak")
     return (ended - begun) / NS_PER_S
 
 
@@ -106,10 +104,10 @@ def killed(life: Life) -> int:
 @pytest.mark.parametrize("late_s", [10.0, 70.0])  # before and after the journal has what it has earned
 def test_a_soak_that_is_left_out_ends_at_once(life: Callable[..., Life], late_s: float):
     here = life()
-    passes_until(here, "Soak", late_s)
+    passes_until(here, "soak", late_s)
     here.do(here.executor.skip(ID[1]))
     here.passes(3.0)
-    assert marks(here) == ["StartChamber done", "Soak skipped", "OpenFlap done"]
+    assert marks(here) == ["start_chamber done", "soak skipped", "open_flap done"]
     assert soaked_s(here) == pytest.approx(late_s, abs=0.6)
     (event,) = [item for item in here.reported if isinstance(item, Event) and item.kind == "plan_changed"]
     assert event.data == {"change": "Skipped", "step_id": ID[1], "steps": 8, "frames": 4}
@@ -117,11 +115,11 @@ def test_a_soak_that_is_left_out_ends_at_once(life: Callable[..., Life], late_s:
 
 def test_a_capture_that_is_left_out_keeps_its_frames(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "Capture", 7.0)
+    passes_until(here, "capture", 7.0)
     here.do(here.executor.skip(ID[3]))
     frames = [item for item in here.reported if isinstance(item, Frame)]
     here.passes(3.0)
-    assert marks(here)[-2:] == ["Capture skipped", "CloseFlap done"]
+    assert marks(here)[-2:] == ["capture skipped", "close_flap done"]
     assert [item for item in here.reported if isinstance(item, Frame)] == frames
     assert here.log.state.size == {"steps": 8, "frames": len(frames)}
     assert 0 < len(frames) < CAPTURE.frames
@@ -129,48 +127,48 @@ def test_a_capture_that_is_left_out_keeps_its_frames(life: Callable[..., Life]):
 
 def test_a_cool_down_and_a_prompt_under_way_are_left_out_and_others_end_by_themselves(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "CoolDown", 10.0)
+    passes_until(here, "cool_down", 10.0)
     here.do(here.executor.skip(ID[5]))
-    passes_until(here, "Prompt", 3.0)
+    passes_until(here, "prompt", 3.0)
     here.call(lambda: here.stand.gate.clear(OPERATOR))
     here.do(here.executor.skip(ID[6]))
-    passes_until(here, "CheckHome", 0.2)
-    with pytest.raises(ConfigError, match=r"step 8 \(CheckHome\) is under way and ends by itself"):
+    passes_until(here, "check_home", 0.2)
+    with pytest.raises(ConfigError, match=r"step 8 \(check_home\) is under way and ends by itself"):
         here.do(here.executor.skip(ID[7]))
     here.passes(10.0)
     assert here.run.done()
-    assert marks(here)[-4:] == ["CoolDown skipped", "Prompt skipped", "CheckHome done", "StopChamber done"]
+    assert marks(here)[-4:] == ["cool_down skipped", "prompt skipped", "check_home done", "stop_chamber done"]
 
 
 def test_a_change_of_another_step_breaks_nothing_off(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "CoolDown", 10.0)
+    passes_until(here, "cool_down", 10.0)
     here.do(here.executor.skip(ID[7]))
     here.passes(10.0)
-    assert marks(here)[-1] == "CheckHome skipped"
+    assert marks(here)[-1] == "check_home skipped"
     assert here.log.state.under_way == ID[5]
 
 
 @pytest.mark.parametrize("late_s", [0.0, 30.0, 70.0])
 def test_a_soak_under_way_that_is_extended_takes_longer_by_that(life: Callable[..., Life], late_s: float):
     here = life()
-    passes_until(here, "Soak", late_s)
+    passes_until(here, "soak", late_s)
     here.do(here.executor.extend(ID[1], 45.0))
     here.passes(150.0)
     assert soaked_s(here) == pytest.approx(145.0)
-    done = next(m for m in here.reported if isinstance(m, StepMark) and m.kind == "Soak" and m.state is StepState.DONE)
+    done = next(m for m in here.reported if isinstance(m, StepMark) and m.kind == "soak" and m.state is StepState.DONE)
     assert done.parameters["duration_s"] == 145.0
     assert done.step_id == ID[1]
 
 
 def test_the_rest_of_a_plan_is_replaced(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "Soak", 10.0)
+    passes_until(here, "soak", 10.0)
     rest = [SetTemperature(26.0), Soak(30.0), StopChamber()]
     here.do(here.executor.edit(2, rest))
     here.passes(200.0)
     assert here.run.done()
-    assert marks(here) == [f"{kind_of(step)} done" for step in (StartChamber(0), Soak(0), *rest)]
+    assert marks(here) == [f"{step.kind} done" for step in (StartChamber(0), Soak(0), *rest)]
     (event,) = [item for item in here.reported if isinstance(item, Event) and item.kind == "plan_changed"]
     assert (event.data["from_index"], event.data["steps"], event.data["frames"]) == (2, 5, 0)
     assert [step_of(each["kind"], each["parameters"]) for each in cast("Any", event.data["by"])] == rest
@@ -178,7 +176,7 @@ def test_the_rest_of_a_plan_is_replaced(life: Callable[..., Life]):
 
 def test_changes_hold_after_a_kill(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "Soak", 20.0)
+    passes_until(here, "soak", 20.0)
     here.do(here.executor.extend(ID[1], 45.0))
     here.do(here.executor.edit(3, [CloseFlap(), Soak(20.0), Soak(11.0), StopChamber()]))
     skipped = here.log.state.plan[4].step_id
@@ -188,13 +186,13 @@ def test_changes_hold_after_a_kill(life: Callable[..., Life]):
     assert (here.log.state.plan, here.log.state.changes) == (state.plan, state.changes)
     here.passes(400.0)
     assert here.run.done()
-    assert marks(here) == ["Soak done", "OpenFlap done", "CloseFlap done", "Soak done", "StopChamber done"]
-    assert marks(here).count("Soak done") == 2
+    assert marks(here) == ["soak done", "open_flap done", "close_flap done", "soak done", "stop_chamber done"]
+    assert marks(here).count("soak done") == 2
 
 
 def test_a_capture_left_out_stays_so_after_a_kill_and_a_second_change_comes_on_top(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "Capture", 7.0)
+    passes_until(here, "capture", 7.0)
     here.do(here.executor.skip(ID[3]))
     here = life(killed(here))
     here.passes(1.0)
@@ -204,13 +202,13 @@ def test_a_capture_left_out_stays_so_after_a_kill_and_a_second_change_comes_on_t
     here.passes(30.0)
     assert here.run.done()
     assert [each.step_id for each in here.log.state.plan[:6]] == ID[:6]
-    assert marks(here)[-1] == "StopChamber done"
+    assert marks(here)[-1] == "stop_chamber done"
     assert not [item for item in here.reported if isinstance(item, Frame)]
 
 
 def test_a_change_whose_line_is_lost_is_known_by_the_recording(life: Callable[..., Life], tmp_path: Path):
     here = life()
-    passes_until(here, "Soak", 20.0)
+    passes_until(here, "soak", 20.0)
     here.do(here.executor.extend(ID[1], 45.0))
     here.do(here.executor.edit(2, [StopChamber()]))
     state, start_ns = here.log.state, killed(here)
@@ -223,7 +221,7 @@ def test_a_change_whose_line_is_lost_is_known_by_the_recording(life: Callable[..
 
 def test_a_plan_that_this_stand_may_not_do_changes_nothing(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "Soak")
+    passes_until(here, "soak")
 
     def refuse(plan):
         raise ConfigError(f"{len(plan)} steps are too many")
@@ -244,14 +242,14 @@ BEGUN = fold(PLAN, [Step(0, ID[0], "started"), Step(0, ID[0], "done"), Step(0, I
     [
         (Skipped(0, ID[1]), ""),
         (Skipped(0, ID[3]), ""),
-        (Skipped(0, ID[0]), "step 1 (StartChamber) is done"),
-        (Skipped(0, ID[2]), "step 3 (OpenFlap) sets up what later steps rely on; replace those from it on"),
+        (Skipped(0, ID[0]), "step 1 (start_chamber) is done"),
+        (Skipped(0, ID[2]), "step 3 (open_flap) sets up what later steps rely on; replace those from it on"),
         (Skipped(0, "x"), "the plan has no step x"),
         (Extended(0, ID[1], 1.0), ""),
-        (Extended(0, ID[3], 1.0), "step 4 (Capture) is no soak"),
-        (Extended(0, ID[1], -1.0), "step 2 (Soak) cannot be extended by -1 s"),
-        (Extended(0, ID[1], math.inf), "step 2 (Soak) cannot be extended by inf s"),
-        (Extended(0, ID[1], math.nan), "step 2 (Soak) cannot be extended by nan s"),
+        (Extended(0, ID[3], 1.0), "step 4 (capture) is no soak"),
+        (Extended(0, ID[1], -1.0), "step 2 (soak) cannot be extended by -1 s"),
+        (Extended(0, ID[1], math.inf), "step 2 (soak) cannot be extended by inf s"),
+        (Extended(0, ID[1], math.nan), "step 2 (soak) cannot be extended by nan s"),
         (Edited(0, 2, []), ""),
         (Edited(0, 9, []), ""),
         (Edited(0, 1, []), "the steps from number 3 on can be replaced, not those from number 2 on"),
@@ -265,7 +263,7 @@ def test_what_cannot_be_changed_says_why_and_changes_nothing(change: Change, why
 
 @pytest.mark.parametrize(
     "change",
-    [Skipped(7, "a"), Extended(7, "a", 1.5), Edited(7, 2, [{"kind": "Soak", "parameters": {"duration_s": 1.0}}])],
+    [Skipped(7, "a"), Extended(7, "a", 1.5), Edited(7, 2, [{"kind": "soak", "parameters": {"duration_s": 1.0}}])],
 )
 def test_a_change_is_the_same_in_the_journal_and_in_the_recording(change: Change):
     assert read_lines(lines_with([change]))[0] == [change]
@@ -276,7 +274,7 @@ def test_a_change_is_the_same_in_the_journal_and_in_the_recording(change: Change
 
 def test_a_plan_that_is_done_takes_no_more_steps(life: Callable[..., Life]):
     here = life()
-    passes_until(here, "Soak")
+    passes_until(here, "soak")
     here.do(here.executor.edit(2, []))
     here.passes(150.0)
     assert here.run.done()
@@ -293,21 +291,21 @@ def test_a_soak_that_waits_for_the_camera_is_longer_at_the_least_and_at_the_most
 
 @pytest.mark.parametrize("step", [*(planned.step for planned in PLAN), MoveTo("linear", 2.0), SetTemperature(20)])
 def test_a_step_is_made_again_of_its_kind_and_parameters(step: Any):
-    assert step_of(kind_of(step), parameters_of(step)) == step
+    assert step_of(step.kind, step.parameters) == step
 
 
 @pytest.mark.parametrize(
     ("kind", "parameters", "why"),
     [
         ("Teleport", {}, "no step is called 'Teleport'"),
-        ("Soak", {}, "Soak: duration_s: "),
-        ("Soak", {"duration_s": "x"}, "Soak: duration_s: "),
-        ("Soak", {"duration_s": -1.0}, "Soak: duration_s is -1.0"),
-        ("Soak", {"duration_s": math.nan}, "Soak: duration_s is nan"),
-        ("Soak", {"duration_s": 1.0, "more": 2}, "Soak has no more"),
-        ("SetTemperature", {"chamber_degC": math.inf}, "SetTemperature: chamber_degC is inf"),
-        ("Capture", {**parameters_of(CAPTURE), "frames": 0}, "Capture: frames is 0"),
-        ("Capture", {**parameters_of(CAPTURE), "role": "x"}, "Capture: role: "),
+        ("soak", {}, "soak: duration_s: "),
+        ("soak", {"duration_s": "x"}, "soak: duration_s: "),
+        ("soak", {"duration_s": -1.0}, "soak: duration_s is -1.0"),
+        ("soak", {"duration_s": math.nan}, "soak: duration_s is nan"),
+        ("soak", {"duration_s": 1.0, "more": 2}, "soak has no more"),
+        ("set_temperature", {"chamber_degC": math.inf}, "set_temperature: chamber_degC is inf"),
+        ("capture", {**CAPTURE.parameters, "frames": 0}, "capture: frames is 0"),
+        ("capture", {**CAPTURE.parameters, "role": "x"}, "capture: role: "),
     ],
 )
 def test_what_is_no_step_is_refused(kind: str, parameters: dict[str, object], why: str):

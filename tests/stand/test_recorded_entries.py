@@ -39,7 +39,7 @@ BEGUN = Begun(1, "night-1", "0f", {})
 
 
 def mark(time_ns: int, step_id: str, state: StepState) -> StepMark:
-    return StepMark(time_ns, step_id, 0, "Capture", state)
+    return StepMark(time_ns, step_id, 0, "capture", state)
 
 
 def plan_changed(change: Skipped) -> Event:

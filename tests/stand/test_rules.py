@@ -83,8 +83,8 @@ def test_an_open_flap_holds_after_five_minutes_unless_a_capture_is_under_way():
     assert (found[0], found[1].rule, found[1].action) == (300, "flap_open", "hold")
 
     capturing = Table()
-    capturing.hub.publish(mark("OpenFlap", StepState.STARTED))
-    capturing.hub.publish(mark("Capture", StepState.STARTED))
+    capturing.hub.publish(mark("open_flap", StepState.STARTED))
+    capturing.hub.publish(mark("capture", StepState.STARTED))
     found = capturing.first_s(4000, flap_position=1.0)
     assert found is not None
     assert (found[0], found[1].rule) == (2700, "flap_open")
@@ -103,8 +103,8 @@ def test_a_flap_or_relay_board_that_cannot_be_asked_holds_after_its_time(channel
 @pytest.mark.parametrize("end", [StepState.DONE, StepState.FAILED])
 def test_a_capture_that_has_ended_excuses_nothing(end: StepState):
     table = Table()
-    table.hub.publish(mark("Capture", StepState.STARTED))
-    table.hub.publish(mark("Capture", end))
+    table.hub.publish(mark("capture", StepState.STARTED))
+    table.hub.publish(mark("capture", end))
     found = table.first_s(4000, flap_position=1.0)
     assert found is not None
     assert found[0] == 300
@@ -137,7 +137,7 @@ def test_what_no_probe_and_no_camera_can_be_is_no_measurement():
 def test_before_anything_is_said_and_after_a_run_no_capture_is_under_way_and_frames_are_taken():
     announced = Announcements()
     assert (announced.is_capturing, announced.frames_stopped, announced.is_paused) == (False, "", False)
-    announced.receive(mark("Capture", StepState.STARTED))
+    announced.receive(mark("capture", StepState.STARTED))
     announced.receive(Event(0, "error", "frames_stopped", "the disk is full"))
     announced.receive(Event(0, "warning", "held", "paused", {"reason": OPERATOR}))
     assert (announced.is_capturing, announced.frames_stopped, announced.is_paused) == (True, "the disk is full", True)
@@ -148,7 +148,7 @@ def test_before_anything_is_said_and_after_a_run_no_capture_is_under_way_and_fra
 def test_all_other_events_and_steps_are_no_business_of_the_rules():
     table = Table()
     table.hub.publish(Event(0, "error", "frames_dropped", "the disk is too slow"))
-    table.hub.publish(mark("Soak", StepState.STARTED))
+    table.hub.publish(mark("soak", StepState.STARTED))
     assert (table.announced.is_capturing, table.announced.frames_stopped) == (False, "")
 
 

@@ -36,8 +36,8 @@ from tests.journals import lines_with, read_lines
 from tests.stand.test_run_table import ID, PLAN, SOAK, S
 
 ids = st.sampled_from([*ID, "unknown"])
-soak = {"kind": "Soak", "parameters": {"duration_s": 5.0}}
-open_flap = {"kind": "OpenFlap", "parameters": {}}
+soak = {"kind": "soak", "parameters": {"duration_s": 5.0}}
+open_flap = {"kind": "open_flap", "parameters": {}}
 KINDS = {
     Step: st.tuples(ids, st.sampled_from(["started", "done"])),
     Dwell: st.tuples(ids, st.floats(0, 200)),
@@ -137,7 +137,7 @@ def test_entries_that_no_run_has_written_are_refused(entry):
         folded(PLAN, read_lines(lines_with([entry]))[0])
 
 
-@pytest.mark.parametrize("by", [[{}], [{"kind": "Soak", "parameters": 5}], [{"kind": ["Soak"], "parameters": {}}]])
+@pytest.mark.parametrize("by", [[{}], [{"kind": "soak", "parameters": 5}], [{"kind": ["soak"], "parameters": {}}]])
 def test_steps_that_are_none_are_refused(by):
     with pytest.raises(ConfigError):
         folded(PLAN, [Edited(0, 13, by)])

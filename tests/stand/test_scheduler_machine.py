@@ -128,7 +128,7 @@ class RunMachine(RuleBasedStateMachine):
     def _on_item(self, item):
         if isinstance(item, Frame):
             self._check_frame(item.step_id)
-        if isinstance(item, StepMark) and item.kind in ("StartChamber", "SetTemperature"):
+        if isinstance(item, StepMark) and item.kind in ("start_chamber", "set_temperature"):
             self.set_open_s = self.life.open_s()
         if isinstance(item, StepMark) and item.step_id in SOAKS_S:
             self._check_soak(item)

@@ -160,7 +160,7 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
         "camera DA1234567",
         "software thermostand 0.1.0, host laboratory",
         "attached config.yaml, target.yaml",
-        "steps 12 done: 12 Capture",
+        "steps 12 done: 12 capture",
         "frames 12, 40 x 30 px, 8 bit, PNG",
         "6 lost by the camera or its wire",
         "step 3 1 of 1 frames from 2026-01-01 18:00:01",
@@ -207,7 +207,7 @@ def test_info_says_what_is_unfinished_and_what_to_do(session: Path):
 def test_verify_tells_what_was_lost_before_the_recording_and_that_the_session_is_sound(session: Path):
     lines = ask("verify", session).stdout.splitlines()
     assert lines[:-1] == [
-        f"note: 1 frame of step {k} (Capture) lost by the camera or its wire" for k in range(2, 13, 2)
+        f"note: 1 frame of step {k} (capture) lost by the camera or its wire" for k in range(2, 13, 2)
     ]
     assert lines[-1].startswith("files sound; run interrupted; 7 segments, 143 messages, 12 frames, ")
 
@@ -261,8 +261,8 @@ def test_a_replay_is_recorded_with_the_same_items(session: Path, tmp_path: Path,
 def test_a_replay_prints_steps_and_events_as_they_come(session: Path, speed: str):
     lines = ask("replay", session, "--speed", speed).stdout.splitlines()
     assert lines[:3] == [
-        "2026-01-01 18:00:00  step 1 Capture started",
-        "2026-01-01 18:00:00  step 1 Capture done",
+        "2026-01-01 18:00:00  step 1 capture started",
+        "2026-01-01 18:00:00  step 1 capture done",
         "2026-01-01 18:00:00  warning note: half second 0, 5 µm",
     ]
     assert len(lines) == 3 * COUNT
@@ -271,7 +271,7 @@ def test_a_replay_prints_steps_and_events_as_they_come(session: Path, speed: str
 def test_a_replay_gives_programs_steps_and_events_one_a_line(session: Path):
     reported = [json.loads(line) for line in ask("replay", session, "--speed", "max", "--json").stdout.splitlines()]
     assert len(reported) == 3 * COUNT
-    assert [each["kind"] for each in reported[:3]] == ["Capture", "Capture", "note"]
+    assert [each["kind"] for each in reported[:3]] == ["capture", "capture", "note"]
     assert (reported[0]["state"], reported[2]["text"]) == ("started", "half second 0, 5 µm")
 
 

@@ -66,7 +66,7 @@ def killed(life: Life) -> int:
 
 def soaked_s(life: Life) -> float | None:
     """How long the soak took in this life, None while it is not done."""
-    marks = [item for item in life.reported if isinstance(item, StepMark) and item.kind == "SoakUntilSettled"]
+    marks = [item for item in life.reported if isinstance(item, StepMark) and item.kind == "soak_until_settled"]
     ends = [mark.time_ns for mark in marks if mark.state is StepState.DONE]
     return (ends[0] - marks[0].time_ns) / NS_PER_S if ends else None
 

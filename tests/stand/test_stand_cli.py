@@ -32,7 +32,7 @@ def test_every_command_explains_itself_with_an_example(command: str):
 def test_plan_lists_steps_and_totals():
     result = runner.invoke(app, ["plan", "thermal-cycle"])
     assert result.exit_code == 0
-    assert "SetTemperature chamber_degC=31.0" in " ".join(result.output.split())
+    assert "set_temperature chamber_degC=31.0" in " ".join(result.output.split())
     assert "GB; started now it ends" in result.output
     assert "49 looks at the drift: a step of the image from 50 mpx on shows" in result.output
 

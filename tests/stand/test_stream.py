@@ -51,7 +51,7 @@ async def test_a_viewer_gets_the_state_then_what_happens_in_order_with_numbers(t
         assert StandState.model_validate(state["data"]).readings["thermometers.granite"].value is None
         desk.tell("first", value=1)
         desk.hub.publish(desk.batch(22.0))
-        desk.hub.publish(StepMark(1, "3-soak", 3, "Soak", StepState.STARTED, {"duration_s": 60.0}))
+        desk.hub.publish(StepMark(1, "3-soak", 3, "soak", StepState.STARTED, {"duration_s": 60.0}))
         desk.tell("last")
         got = [await until(viewer, kind) for kind in ("event", "reading", "event", "event")]
         assert [each["seq"] for each in got] == list(range(state["seq"] + 1, state["seq"] + 5))

@@ -122,18 +122,18 @@ def test_what_an_operator_changes_of_the_plan_changes_the_time_left(config: Stan
     assert [eta.expected_s(each.step_id) for each in plan] == [650.0, 307.0, 60.0]
     assert eta.ends_s(now_ns) == {first: 550.0, second: 857.0, third: 917.0}
     eta.event(changed(Skipped(0, plan[2].step_id)))
-    eta.mark(StepMark(now_ns, plan[2].step_id, 2, "Soak", StepState.SKIPPED))
+    eta.mark(StepMark(now_ns, plan[2].step_id, 2, "soak", StepState.SKIPPED))
     assert eta.left_s(now_ns) == 857.0
     by: list[dict[str, object]] = [
-        {"kind": "Soak", "parameters": {"duration_s": each_s}} for each_s in (20.0, 30.0, 40.0)
+        {"kind": "soak", "parameters": {"duration_s": each_s}} for each_s in (20.0, 30.0, 40.0)
     ]
     eta.event(changed(Edited(0, 1, by)))
     assert (eta.left_s(now_ns), eta.count) == (640.0, 4)
     assert list(eta.ends_s(now_ns).values()) == [550.0, 570.0, 600.0, 640.0]
-    eta.mark(StepMark(now_ns, plan[0].step_id, 0, "Soak", StepState.SKIPPED))
+    eta.mark(StepMark(now_ns, plan[0].step_id, 0, "soak", StepState.SKIPPED))
     eta.event(changed(Skipped(0, plan[0].step_id)))
     assert eta.left_s(now_ns) == 90.0
-    eta.mark(StepMark(now_ns, "b", 1, "Soak", StepState.STARTED))
+    eta.mark(StepMark(now_ns, "b", 1, "soak", StepState.STARTED))
     assert eta.left_s(now_ns + 5 * NS_PER_S) == 85.0
 
 
@@ -154,7 +154,7 @@ async def test_runs_teach_what_work_takes_and_the_median_counts(tmp_path: Path, 
     assert learned.nights == ("night-0", "night-1", "night-2")
     assert learned.overheads_s["flap travel"] == pytest.approx(1.2, abs=1e-3)
     assert learned.overheads_s["flap at rest"] == pytest.approx(0.2, abs=1e-3)
-    assert learned.overheads_s["Capture"] == pytest.approx(0.4, abs=1e-3)
+    assert learned.overheads_s["capture"] == pytest.approx(0.4, abs=1e-3)
     assert "home and move linear" in learned.overheads_s
     assert load_learned(tmp_path) == learned
     assert "3 runs, the last night-2" in str(learned)

@@ -33,9 +33,9 @@ def moment(time_ns: int, index: int, role: str | None = None):
     """A capture of one frame."""
     step = f"capture-{index}"
     parameters: dict[str, object] = {"role": role or ROLES[index]}
-    yield StepMark(time_ns, step, index, "Capture", StepState.STARTED, parameters)
+    yield StepMark(time_ns, step, index, "capture", StepState.STARTED, parameters)
     yield Frame("camera.image", IMAGE, time_ns, 0.1, 0.0, 40.0, index + 1, 1000 * index, 0, step)
-    yield StepMark(time_ns, step, index, "Capture", StepState.DONE, parameters)
+    yield StepMark(time_ns, step, index, "capture", StepState.DONE, parameters)
 
 
 @pytest.fixture

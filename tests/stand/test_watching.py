@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from rich.live import Live
 
-from experiments.steps import Capture, Role, Soak, number_steps, parameters_of
+from experiments.steps import Capture, Role, Soak, number_steps
 from experiments.words import doing_in_words
 from foundation.clock import NS_PER_S
 from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, SOAK_LONGER
@@ -72,9 +72,7 @@ SOAK_ID = next(number_steps([Soak(600.0)])).step_id
 
 def mark(seconds: float, index: int, state: StepState) -> StepMark:
     step = (Soak(600.0), Capture(2, 1.0, 0.01, Role.FIT, 24.0))[index]
-    return StepMark(
-        BEGIN_NS + int(seconds * NS_PER_S), str(index), index, type(step).__name__, state, parameters_of(step)
-    )
+    return StepMark(BEGIN_NS + int(seconds * NS_PER_S), str(index), index, step.kind, state, step.parameters)
 
 
 def test_a_run_is_followed_from_its_first_step_on(follow: tuple[Follow, list[Moment], list[str]]):

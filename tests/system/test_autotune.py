@@ -34,7 +34,7 @@ async def operated(run: Coroutine[None, None, Path], operate: Coroutine[None, No
     return await running
 
 
-@pytest.mark.parametrize("step", ["Soak", by_night("SetTemperature")])
+@pytest.mark.parametrize("step", ["soak", by_night("set_temperature")])
 async def test_autotuning_is_held_and_the_run_goes_on_after_clear(
     tmp_path: Path, order: Callable[..., Order], step: str
 ):
@@ -65,12 +65,12 @@ async def test_autotuning_is_held_and_the_run_goes_on_after_clear(
     (held_ns,) = [event.time_ns for event in events if event.kind == "guard.device_fault"]
     (begun_ns, *_) = [mark.time_ns for mark in session.steps() if mark.kind == step]
     assert held_ns - begun_ns <= 60e9
-    assert len([event for event in events if event.kind == "regulator_occupied"]) == (step == "SetTemperature")
+    assert len([event for event in events if event.kind == "regulator_occupied"]) == (step == "set_temperature")
 
 
 async def test_autotuning_that_ends_before_it_is_held_costs_only_the_wait(tmp_path: Path, order: Callable[..., Order]):
     ordered, out, watcher = order(SHORT_RECIPE), tmp_path / "out", Watcher()
-    press = at_step("SetTemperature", lambda: break_now(ordered, "regulator.autotune", True))
+    press = at_step("set_temperature", lambda: break_now(ordered, "regulator.autotune", True))
 
     def watch(hub: Hub) -> None:
         press(hub)

@@ -23,7 +23,7 @@ def _aravis() -> None:
 
 async def test_a_frozen_camera_temperature_is_stale_in_the_recording(tmp_path: Path, order: Callable[..., Order]):
     ordered = order(SHORT_RECIPE)
-    watch = at_step("Soak", lambda: break_now(ordered, "camera.frozen_temperature", True))
+    watch = at_step("soak", lambda: break_now(ordered, "camera.frozen_temperature", True))
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, watch))
     batches = [item for item in session.items() if isinstance(item, Batch)]
     readings = [each for batch in batches for each in batch.readings if each.channel == "camera.temperature"]

@@ -68,7 +68,7 @@ async def test_a_soak_with_a_cold_camera_is_not_credited(tmp_path: Path, order: 
 
     def watch(hub: Hub) -> None:
         hub.subscribe(watcher)
-        at_step("Soak", lambda: tasks.append(asyncio.create_task(drop())))(hub)
+        at_step("soak", lambda: tasks.append(asyncio.create_task(drop())))(hub)
 
     directory = await run_virtual(ordered, out, None, watch)
     await asyncio.gather(*tasks)

@@ -81,7 +81,7 @@ async def test_a_temperature_that_goes_holds_the_run_until_it_is_back(tmp_path: 
     def watch(hub: Hub) -> None:
         hub.subscribe(follow)
         break_it = at_step(
-            "Soak", lambda: tasks.append(asyncio.create_task(fault(ordered, "camera.no_temperature", True)))
+            "soak", lambda: tasks.append(asyncio.create_task(fault(ordered, "camera.no_temperature", True)))
         )
         break_it(hub)
 

@@ -67,7 +67,7 @@ def test_a_warm_up_that_was_killed_begins_again_from_a_cold_camera(tmp_path: Pat
     assert session.frame_count > 8
     assert frames[0].camera_degC < 27.0
     assert frames[-1].camera_degC > frames[0].camera_degC + 1.0
-    marks = [mark for mark in session.steps() if mark.kind == "CoolDown" and mark.state is StepState.DONE]
+    marks = [mark for mark in session.steps() if mark.kind == "cool_down" and mark.state is StepState.DONE]
     assert len(marks) == 3
     assert marks[-1].time_ns > begins_ns[capture.step_id]
 
@@ -129,7 +129,7 @@ async def test_a_prompt_that_somebody_attends_to_holds_the_run(
     assert (counted["prompt"], counted["prompt_skipped"]) == (1, 0 if attended else 1)
     assert counted["held"] == counted["released"] == counted["continued"] == int(attended)
     if attended:
-        assert kinds.index("prompt") < kinds.index("held") < kinds.index("released") < kinds.index("Prompt done")
+        assert kinds.index("prompt") < kinds.index("held") < kinds.index("released") < kinds.index("prompt done")
     assert len(session.frame_metas) == 2
 
 
@@ -190,9 +190,9 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_again_from_a_cold_cam
     assert len(counted) == 8
     assert counted[0].camera_degC < 27.0
     assert counted[-1].camera_degC > counted[0].camera_degC + 1.0
-    marks = [item for item in items if isinstance(item, StepMark) and item.kind in ("PowerCamera", "CoolDown")]
+    marks = [item for item in items if isinstance(item, StepMark) and item.kind in ("power_camera", "cool_down")]
     done = [mark.kind for mark in marks if mark.state is StepState.DONE]
-    assert done == ["PowerCamera", "CoolDown", "PowerCamera"] * 2
+    assert done == ["power_camera", "cool_down", "power_camera"] * 2
 
 
 async def paused(order: Order, out: Path, pause_s: float) -> Session:
@@ -247,6 +247,6 @@ async def test_a_warm_up_that_is_paused_for_long_begins_again_from_its_cool_down
     assert len(before) >= 3  # more on a busy machine: virtual time goes on until the pause is there
     assert len(session.frame_metas) == 8 + len(before)
     assert counted[0].camera_degC < 27.0
-    cooled = [mark for mark in session.steps() if mark.kind == "CoolDown" and mark.state is StepState.DONE]
+    cooled = [mark for mark in session.steps() if mark.kind == "cool_down" and mark.state is StepState.DONE]
     assert len(cooled) == 2
     assert [event for event in session.events() if event.kind == "flap_shut_in_hold"]

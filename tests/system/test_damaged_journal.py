@@ -52,7 +52,7 @@ async def test_a_stopped_run_goes_on_without_the_first_line_of_its_journal_and_o
 ):
     ordered, out = order(SHORTER), tmp_path / "out"
     with pytest.raises(Interrupted):
-        await run_virtual(ordered, out, 7, at_step("Capture", lambda: os.kill(os.getpid(), signal.SIGINT)))
+        await run_virtual(ordered, out, 7, at_step("capture", lambda: os.kill(os.getpid(), signal.SIGINT)))
     (directory,) = out.iterdir()
     assert (glance(directory).run, verify(directory).files) == (Run.STOPPED, Files.SOUND)
     count = flip(directory, 0, 2, -1)
@@ -105,7 +105,7 @@ def test_a_killed_run_is_interrupted_and_once_salvaged_its_files_are_sound(
 
 async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path: Path, order: Callable[..., Order]):
     ordered, tasks = order(SHORTER, guard={"safe_limit_s": 5}), list[asyncio.Task[None]]()
-    break_sensor = at_step("Soak", lambda: tasks.append(asyncio.create_task(fault(ordered, "thermometer.open", "air"))))
+    break_sensor = at_step("soak", lambda: tasks.append(asyncio.create_task(fault(ordered, "thermometer.open", "air"))))
     with pytest.raises(StandTripped):
         await run_virtual(ordered, tmp_path / "out", None, break_sensor)
     await asyncio.gather(*tasks)

@@ -61,11 +61,11 @@ def items(order, index, time_ns, name):
     step_id = list(order.recipe.plan())[index].step_id
     if not index:
         yield Event(time_ns, "info", "run.start", "", {"steps": 40, "frames": SECONDS, "plan": "", "seed": 7})
-    yield StepMark(time_ns, step_id, index, "Capture", StepState.STARTED, {})
+    yield StepMark(time_ns, step_id, index, "capture", StepState.STARTED, {})
     yield Batch("thermometers", time_ns, (Reading("thermometers.air", 20 + index / 8, "degC", time_ns),))
     image = np.random.default_rng(index + len(name)).integers(0, 255, (60, 60), np.uint8)
     yield Frame("camera.image", image, time_ns - NS_PER_S // 10, 0.1, 0.0, 41.0, index, 7 * index, 0, step_id)
-    yield StepMark(time_ns, step_id, index, "Capture", StepState.DONE, {})
+    yield StepMark(time_ns, step_id, index, "capture", StepState.DONE, {})
     if name == TRIPPED and index == SECONDS - 1:
         yield Event(time_ns, "error", "run.end", "too hot", {"status": "tripped"})
 

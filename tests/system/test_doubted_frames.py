@@ -42,7 +42,7 @@ async def test_frames_of_a_camera_that_is_wrong_at_each_capture_say_so(tmp_path:
     ordered, captures = order(RECIPE, camera=WHOLE_SENSOR), list[str]()
 
     def follow(item: Item) -> None:
-        if not isinstance(item, StepMark) or item.kind != "Capture":
+        if not isinstance(item, StepMark) or item.kind != "capture":
             return
         if item.state is StepState.STARTED:
             captures.append(item.step_id)

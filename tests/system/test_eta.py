@@ -40,7 +40,7 @@ def following(follow: Follow) -> tuple[Callable[[Hub], None], list[tuple[int, fl
         reached: list[Item] = []
 
         def look(item: Item) -> None:
-            if isinstance(item, StepMark) and item.kind.startswith("Soak") and item.state is StepState.DONE:
+            if isinstance(item, StepMark) and item.kind.startswith("soak") and item.state is StepState.DONE:
                 reached.append(item)
             if reached and isinstance(item, Batch | StepMark):
                 left.append((item.time_ns, follow.eta.left_s(item.time_ns)))
@@ -137,7 +137,7 @@ def test_the_console_shows_no_time_gained_in_a_pause(order: Callable[..., Order]
     steps = price(ordered.recipe.plan(), ordered.config)
     follow = Follow("a night", Night(steps), shown.append, lambda line: None)
     soak = next(step.planned for step in steps if isinstance(step.planned.step, Soak))
-    follow(StepMark(0, soak.step_id, soak.index, "Soak", StepState.STARTED))
+    follow(StepMark(0, soak.step_id, soak.index, "soak", StepState.STARTED))
     follow(Event(100 * NS_PER_S, "warning", "held", "", {"reason": "operator"}))
     follow(Batch("regulator", 100 * NS_PER_S, ()))
     left_s = follow.eta.left_s(100 * NS_PER_S)

@@ -38,7 +38,7 @@ async def test_a_poll_that_fails_on_the_wire_is_asked_again_and_ends_no_night(
 ):
     """Three garbled replies are one poll with all its repeats; a reply 20 time-outs late spoils the repeats as well."""
     ordered = order(SHORTER, wire=wire, bus=QUICK)
-    watch = at_step("Soak", lambda: break_now(ordered, name, value))
+    watch = at_step("soak", lambda: break_now(ordered, name, value))
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, watch))
     lost = [event for event in session.events() if event.kind == "device_lost"]
     assert len(lost) >= 1
@@ -59,7 +59,7 @@ async def test_a_line_that_stays_garbled_trips_when_no_good_reading_is_young_eno
     tmp_path: Path, order: Callable[..., Order]
 ):
     ordered = order(SHORTER, bus=QUICK)
-    garble = at_step("Soak", lambda: break_now(ordered, "bus.garbled", 1_000_000))
+    garble = at_step("soak", lambda: break_now(ordered, "bus.garbled", 1_000_000))
 
     def mend(item: Item) -> None:
         if isinstance(item, Event) and item.kind.startswith("guard."):
@@ -85,7 +85,7 @@ async def test_a_device_that_says_itself_that_it_measures_nothing_trips_at_the_s
     tmp_path: Path, order: Callable[..., Order], name: str, value: object, channel: str
 ):
     ordered = order(SHORTER)
-    watch = at_step("Soak", lambda: break_now(ordered, name, value))
+    watch = at_step("soak", lambda: break_now(ordered, name, value))
     with pytest.raises(StandTripped, match=f"{channel} is BAD"):
         await run_virtual(ordered, tmp_path / "out", None, watch)
     (directory,) = (tmp_path / "out").iterdir()

@@ -54,7 +54,7 @@ def events_of(session: Session, kind: str) -> list[Event]:
 
 def last_soak_ns(session: Session) -> tuple[int, int]:
     """Of the soak at 34 degC: when it began and ended for good."""
-    marks = [item for item in session.items() if isinstance(item, StepMark) and item.kind == "Soak" and item.index == 7]
+    marks = [item for item in session.items() if isinstance(item, StepMark) and item.kind == "soak" and item.index == 7]
     return marks[0].time_ns, next(mark.time_ns for mark in reversed(marks) if mark.state is StepState.DONE)
 
 

@@ -137,7 +137,7 @@ async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_opera
 ):
     reported, tasks = tmp_path / "reported", list[asyncio.Task[None]]()
     ordered = telling(order(LONG_SOAK, bus={"timeout_s": 0.1}), reported)
-    begins = once_warm if name == "heater.cut_out" else partial(at_step, "Soak")  # the first heat has its own rule
+    begins = once_warm if name == "heater.cut_out" else partial(at_step, "soak")  # the first heat has its own rule
     watch = begins(lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))
     with pytest.raises(StandTripped) as caught:
         await run_virtual(ordered, tmp_path / "out", None, watch)
@@ -261,7 +261,7 @@ async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_ro
 
 
 async def test_a_terminal_that_is_closed_leaves_the_stand_safe(tmp_path: Path, order: Callable[..., Order]):
-    hang_up = at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGHUP))
+    hang_up = at_step("soak", lambda: os.kill(os.getpid(), signal.SIGHUP))
     with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
         await run_virtual(order(LONG_SOAK), tmp_path / "out", None, hang_up)
     (directory,) = (tmp_path / "out").iterdir()
@@ -284,7 +284,7 @@ async def test_a_poller_or_listener_that_fails_unexpectedly_leaves_the_stand_saf
 
     def watch(hub: Hub) -> None:
         hub.subscribe(listen)
-        at_step("Soak", lambda: failing.append(True))(hub)
+        at_step("soak", lambda: failing.append(True))(hub)
 
     with pytest.raises(RuntimeError, match="nor that"):
         await run_virtual(order(LONG_SOAK), tmp_path / "out", None, watch)

@@ -72,7 +72,7 @@ async def test_a_suspend_and_a_step_of_the_system_clock_are_recorded_and_instant
 
     def watch(hub: Hub) -> None:
         def move(item: Item) -> None:
-            if isinstance(item, StepMark) and item.kind == "Soak" and not host.step_ns:
+            if isinstance(item, StepMark) and item.kind == "soak" and not host.step_ns:
                 host.suspended_ns, host.step_ns = seconds_ns(40), seconds_ns(-3600)
 
         hub.subscribe(move)

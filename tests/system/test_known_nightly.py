@@ -45,7 +45,7 @@ async def test_a_night_decides_from_what_it_has_recorded_and_the_same_from_the_s
     entries, _ = read_lines((session.path / "journal.jsonl").read_bytes())
     decisions = [entry for entry in entries if isinstance(entry, Edited)]
     assert not [event.text for event in session.events() if event.kind == "undecided"]
-    visited = [mark.parameters["chamber_degC"] for mark in session.steps() if mark.kind == Capture.__name__]
+    visited = [mark.parameters["chamber_degC"] for mark in session.steps() if mark.kind == Capture.kind]
     assert {14.0, 34.0} < set(visited)
     by_model = [each.reason.startswith("the residual is predicted") for each in decisions]
     assert not by_model[0]

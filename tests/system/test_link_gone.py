@@ -54,7 +54,7 @@ class Cut:
 
         def follow(hub: Hub) -> None:
             hub.subscribe(self.watcher)
-            at_step("Soak", cut)(hub)
+            at_step("soak", cut)(hub)
 
         return follow
 
@@ -108,7 +108,7 @@ async def test_a_second_signal_a_minute_later_ends_the_wait_and_earlier_ones_do_
     assert "relays did not confirm its safe state" in str(caught.value)
     assert "regulator did not confirm its safe state" in str(caught.value)
     session = Session.open(next((tmp_path / "out").iterdir()))
-    begun = next(mark for mark in session.steps() if mark.kind == "Soak")
+    begun = next(mark for mark in session.steps() if mark.kind == "soak")
     assert 60 <= (session.events()[-1].time_ns - begun.time_ns) / NS_PER_S < 90
     assert len(cut.said()) == 1
 

@@ -75,7 +75,7 @@ async def test_a_night_with_two_restless_operators_is_whole(tmp_path: Path, orde
     assert all(text.count("\n") == 0 for text in refused)
 
 
-PHASES = ("opening", "Prompt", "CoolDown", "Capture", "held", "run.end")
+PHASES = ("opening", "prompt", "cool_down", "capture", "held", "run.end")
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -83,7 +83,7 @@ async def test_stop_pressed_twice_in_any_phase_leaves_the_stand_safe(
     tmp_path: Path, order: Callable[..., Order], phase: str
 ):
     """While the stand is opened there is no run yet to be asked; when it ends, there is nothing left to stop."""
-    ordered, out = replace(order(PROMPTED), attended=phase == "Prompt"), tmp_path / "out"
+    ordered, out = replace(order(PROMPTED), attended=phase == "prompt"), tmp_path / "out"
     pressed, answers = list[asyncio.Task[None]](), list[object]()
 
     async def press_stop(directory: Path) -> None:
@@ -102,7 +102,7 @@ async def test_stop_pressed_twice_in_any_phase_leaves_the_stand_safe(
 
     def follow(item: Item) -> None:
         begins = isinstance(item, StepMark) and item.state is StepState.STARTED and item.kind == phase
-        if phase == "held" and isinstance(item, StepMark) and item.kind == "CoolDown":
+        if phase == "held" and isinstance(item, StepMark) and item.kind == "cool_down":
             pressed.append(asyncio.create_task(pause(next(out.iterdir()))))
         if begins or (isinstance(item, Event) and item.kind == phase):
             pressed.append(asyncio.create_task(press_stop(next(out.iterdir()))))

@@ -92,9 +92,9 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
     ]
     marks = [(mark.index, mark.kind, mark.state) for mark in session.steps() if mark.state is not StepState.STARTED]
     ends = [(index, kind) for index, kind, state in marks if state is StepState.DONE]
-    assert (first.index, "Capture", StepState.SKIPPED) in marks
-    expected = [(p.index, type(p.step).__name__) for p in plan[: other.index + 1] if p != first]
-    assert ends == expected + [(other.index + 1 + index, type(step).__name__) for index, step in enumerate(rest)]
+    assert (first.index, "capture", StepState.SKIPPED) in marks
+    expected = [(p.index, p.step.kind) for p in plan[: other.index + 1] if p != first]
+    assert ends == expected + [(other.index + 1 + index, step.kind) for index, step in enumerate(rest)]
     soaked = next(mark for mark in session.steps() if mark.step_id == soak.step_id and mark.state is StepState.DONE)
     assert soaked.parameters["duration_s"] == 360.0
     assert session.frame_count == 2

@@ -85,7 +85,7 @@ def test_a_killed_queue_goes_on_where_it_was_and_comes_to_its_end(tmp_path: Path
         assert session.incomplete == ()
         captures = {planned.step_id: planned.step.frames for planned in plan if isinstance(planned.step, Capture)}
         assert session.frame_count == sum(captures.values()) == 4
-        done = [step.step_id for step in session.steps() if step.state is StepState.DONE and step.kind == "Capture"]
+        done = [step.step_id for step in session.steps() if step.state is StepState.DONE and step.kind == "capture"]
         assert sorted(done) == sorted(captures)
         # One temperature is too few for a fit, which is no reason for a run to fail.
         assert f"{out / entry.session} is recorded, but not reported" in ended.stderr

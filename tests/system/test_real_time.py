@@ -77,7 +77,7 @@ async def test_an_interrupt_leaves_the_stand_safe_and_the_session_readable(
 
     def watch(hub: Hub) -> None:
         def interrupt(item: Item) -> None:
-            if isinstance(item, StepMark) and item.kind == "Soak":
+            if isinstance(item, StepMark) and item.kind == "soak":
                 os.kill(os.getpid(), signal.SIGINT)
 
         hub.subscribe(interrupt)

@@ -188,7 +188,7 @@ def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_
 
     order = load_order("overnight", str(out.parent / "stand.yaml"))
     expected_s = {step.planned.step_id: step.duration_s for step in price(order.recipe.plan(), order.config)}
-    marks = [mark for mark in session.steps() if mark.kind != "CoolDown"]  # the simulated camera is cold already
+    marks = [mark for mark in session.steps() if mark.kind != "cool_down"]  # the simulated camera is cold already
     took_s = sum((end.time_ns - begin.time_ns) / 1e9 for begin, end in zip(marks[::2], marks[1::2], strict=True))
     assert took_s == pytest.approx(sum(expected_s[mark.step_id] for mark in marks[::2]), rel=0.02)
     assert sum(expected_s.values()) < 14 * 3600  # 18:00 to 08:00

@@ -149,7 +149,7 @@ def test_a_capture_that_was_killed_is_completed_at_its_temperature(tmp_path: Pat
     kinds = [event.kind for event in session.events()]
     assert kinds.index("gap") < kinds.index("run.resume") < kinds.index("soak_restarted") < kinds.index("restored")
     times_ns, pv_degC = session.readings("regulator.pv")
-    labels = {mark.step_id: mark.parameters.get("chamber_degC") for mark in session.steps() if mark.kind == "Capture"}
+    labels = {mark.step_id: mark.parameters.get("chamber_degC") for mark in session.steps() if mark.kind == "capture"}
     killed = [time_ns for time_ns, meta in session.frame_metas if labels[meta.step_id] == 30]
     assert len(killed) >= 6
     assert all(abs(pv_degC[times_ns <= time_ns][-1] - 30) < 1.0 for time_ns in killed)
@@ -172,7 +172,7 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
         await asyncio.to_thread(ask, directory, "stop")
 
     def start(work: Callable[[], Coroutine[None, None, None]]) -> Callable[[Hub], None]:
-        return at_step("Soak", lambda: tasks.append(asyncio.create_task(work())))
+        return at_step("soak", lambda: tasks.append(asyncio.create_task(work())))
 
     with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
         await run_virtual(ordered, out, None, start(pause_and_stop))

@@ -50,7 +50,7 @@ def config_of(tmp_path: Path, name: str = "laboratory", **sections: dict[str, ob
     return load_config(file)
 
 
-def stopped(kind: str = "Soak") -> Callable[..., None]:
+def stopped(kind: str = "soak") -> Callable[..., None]:
     return at_step(kind, lambda: os.kill(os.getpid(), signal.SIGINT))
 
 
@@ -76,7 +76,7 @@ def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_sai
     before = findable(interruption(directory))
     assert "touch" in before.order.config_text  # what is recorded stays as it was
     with pytest.raises(StandTripped, match=r"thermometers\.air is BAD"):
-        asyncio.run(resume(before, at_step("Soak", broken)))
+        asyncio.run(resume(before, at_step("soak", broken)))
     resumed = CliRunner().invoke(app, ["resume", str(directory), "--clear"])
     assert resumed.exit_code == 0, resumed.output
     said = [line for line in resumed.stderr.splitlines() if "as on this stand" in line]

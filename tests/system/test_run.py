@@ -76,7 +76,7 @@ async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_p
 
     session = Session.open(first)
     assert session.frame_count == 5
-    captures = {step.step_id: step for step in session.steps() if step.kind == "Capture"}
+    captures = {step.step_id: step for step in session.steps() if step.kind == "capture"}
     frames = list(session.frames())
     assert all(frame.step_id in captures for frame in frames)
     assert frames[0].image.shape == (CORNER["height_px"], CORNER["width_px"])
@@ -86,7 +86,7 @@ async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_p
 
     with pytest.raises(Interrupted):  # of another seed the first frames are enough
         await run_virtual(
-            ordered, tmp_path / "third", 8, at_step("SetTemperature", lambda: os.kill(os.getpid(), signal.SIGINT))
+            ordered, tmp_path / "third", 8, at_step("set_temperature", lambda: os.kill(os.getpid(), signal.SIGINT))
         )
     third = Session.open(next((tmp_path / "third").iterdir()))
     assert not np.array_equal(next(third.frames()).image, frames[0].image)
@@ -95,7 +95,7 @@ async def test_the_same_recipe_and_seed_twice_give_byte_identical_sessions(tmp_p
 def check_temperatures(session: Session) -> None:
     """The chamber follows its set-points, the camera heats itself, and the last word is a stand at rest."""
     times_ns, pv_degC = session.readings("regulator.pv")
-    marks = [step for step in session.steps() if step.kind == "SetTemperature" and step.state is StepState.DONE]
+    marks = [step for step in session.steps() if step.kind == "set_temperature" and step.state is StepState.DONE]
     for mark, end in zip(marks, [*marks[1:], session.steps()[-1]], strict=True):
         before_end = pv_degC[(times_ns > mark.time_ns) & (times_ns < end.time_ns)][-5:]
         wanted = float(str(mark.parameters["chamber_degC"]))
@@ -127,7 +127,7 @@ async def test_a_lost_safety_sensor_makes_the_stand_safe_and_ends_the_run(
     events: list[Event] = []
 
     def watch(hub: Hub) -> None:
-        at_step("Soak", lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))(hub)
+        at_step("soak", lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))(hub)
         hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
 
     with pytest.raises(StandTripped, match=reason):
@@ -140,7 +140,7 @@ async def test_a_lost_safety_sensor_makes_the_stand_safe_and_ends_the_run(
         assert session.readings("relays.heater_enable")[1][-1] == 0
         assert session.readings("regulator.running")[1][-1] == 0
     failed = [step for step in session.steps() if step.state is StepState.FAILED]
-    assert [step.kind for step in failed] == ["Soak"]
+    assert [step.kind for step in failed] == ["soak"]
 
 
 DAEMON = """
@@ -205,7 +205,7 @@ SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").repl
 EVERY_KIND = SHORT_RECIPE.replace("frames_per_point: 1", "frames_per_point: 20")
 
 
-@pytest.mark.parametrize("kind", ["MoveTo", "StartChamber", "Soak", "OpenFlap", "Capture", "CloseFlap"])
+@pytest.mark.parametrize("kind", ["move_to", "start_chamber", "soak", "open_flap", "capture", "close_flap"])
 async def test_an_interrupt_in_any_step_leaves_the_stand_safe(tmp_path: Path, order: Callable[..., Order], kind: str):
     """The step's own command is on the wire when the interrupt comes: it must not win over making safe."""
     with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
@@ -269,7 +269,7 @@ def refusing_from_the_first_capture(until: Callable[[Item], bool]) -> Callable[[
             if until(item):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
 
-        at_step("Capture", lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard)))(hub)
+        at_step("capture", lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard)))(hub)
         hub.subscribe(lift)
 
     return watch
@@ -335,7 +335,7 @@ async def test_an_existing_session_is_never_overwritten(tmp_path: Path, order: C
     taken = tmp_path / "out" / "20260101T180000Z-short"
     taken.mkdir(parents=True)
     (tmp_path / "out" / "20260101T180000Z-short-2").symlink_to("nowhere")
-    watch = at_step("MoveTo", lambda: os.kill(os.getpid(), signal.SIGINT))
+    watch = at_step("move_to", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):
         await run_virtual(ordered, tmp_path / "out", None, watch)
     assert not list(taken.iterdir())

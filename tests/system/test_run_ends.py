@@ -70,7 +70,7 @@ async def test_somebody_is_notified_of_a_step_that_fails_and_of_the_run_that_end
     tmp_path: Path, order: Callable[..., Order]
 ):
     reported, ordered = tmp_path / "reported", order(SHORTER)
-    watch = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
+    watch = at_step("soak", lambda: break_now(ordered, "flap.jam", 500))
     with pytest.raises(NotCleared) as caught:
         await run_virtual(telling(ordered, reported), tmp_path / "out", None, watch)
     (directory,) = (tmp_path / "out").iterdir()
@@ -96,7 +96,7 @@ async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_comp
 
 async def test_nobody_is_notified_of_a_run_that_the_operator_stopped(tmp_path: Path, order: Callable[..., Order]):
     reported = tmp_path / "reported"
-    stop = at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT))
+    stop = at_step("soak", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):
         await run_virtual(telling(order(SHORTER), reported), tmp_path / "out", None, stop)
     assert not reported.exists()
@@ -110,7 +110,7 @@ async def test_what_happened_before_the_recording_began_is_in_it(tmp_path: Path,
     await end_laboratory(ordered)
     (killed,) = out.iterdir()
     with pytest.raises(Interrupted):
-        await run_virtual(order(SHORTER), out, None, at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT)))
+        await run_virtual(order(SHORTER), out, None, at_step("soak", lambda: os.kill(os.getpid(), signal.SIGINT)))
     (directory,) = set(out.iterdir()) - {killed}
     events = Session.open(directory).events()
     assert [event.kind for event in events[:1]] == ["salvaged"]
@@ -148,17 +148,17 @@ def left_since(before: Counter[str]) -> Counter[str]:
 
 async def test_a_run_leaves_nothing_behind_however_it_ends(tmp_path: Path, order: Callable[..., Order]):
     ordered = order(SHORTER)
-    interrupt = at_step("Soak", lambda: os.kill(os.getpid(), signal.SIGINT))
+    interrupt = at_step("soak", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):  # the first one loads what stays
         await run_virtual(ordered, tmp_path / "first", None, interrupt)
     before = held_now()
     await run_virtual(ordered, tmp_path / "complete", None, ignore)
     assert not left_since(before)
-    stop = at_step("Capture", lambda: os.kill(os.getpid(), signal.SIGINT))
+    stop = at_step("capture", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):
         await run_virtual(ordered, tmp_path / "stopped", None, stop)
     assert not left_since(before)
-    broken = at_step("Soak", lambda: break_now(ordered, "flap.jam", 500))
+    broken = at_step("soak", lambda: break_now(ordered, "flap.jam", 500))
     with pytest.raises(NotCleared):
         await run_virtual(ordered, tmp_path / "failed", None, broken)
     assert not left_since(before)
@@ -170,11 +170,11 @@ async def test_a_run_in_real_time_leaves_no_thread_behind(
 ):
     ordered = order(SHORTER, camera={"boot_s": 0.5})
     await asyncio.to_thread(simulator, ordered.config, False)
-    stop = at_step("MoveTo", lambda: os.kill(os.getpid(), signal.SIGINT))
+    stop = at_step("move_to", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):
         await run_real(ordered, tmp_path / "first", stop)
     before = held_now()
-    stop = at_step("MoveTo", lambda: os.kill(os.getpid(), signal.SIGINT))
+    stop = at_step("move_to", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):
         await run_real(ordered, tmp_path / "second", stop)
     assert not left_since(before)

@@ -63,7 +63,7 @@ async def test_the_sequences_run_over_the_wire_and_leave_what_the_paper_needs(
 
 def captures(session: Session) -> list[tuple[StepMark, StepMark]]:
     """Beginning and end of each capture."""
-    marks = [mark for mark in session.steps() if mark.kind == "Capture"]
+    marks = [mark for mark in session.steps() if mark.kind == "capture"]
     assert [mark.state for mark in marks] == [StepState.STARTED, StepState.DONE] * (len(marks) // 2)
     return list(zip(marks[::2], marks[1::2], strict=True))
 
@@ -90,7 +90,7 @@ def check_events(events: list[Event]) -> None:
 
 def check_warm_up(session: Session) -> None:
     """The second time the camera is warm before, and at the air's temperature when it is switched on again."""
-    marks = [mark for mark in session.steps() if mark.kind == "CoolDown"]
+    marks = [mark for mark in session.steps() if mark.kind == "cool_down"]
     waits_s = [(end.time_ns - begin.time_ns) / 1e9 for begin, end in zip(marks[::2], marks[1::2], strict=True)]
     assert waits_s[0] < 60.0 < waits_s[1]
     metas = session.frame_metas
@@ -102,7 +102,7 @@ def check_warm_up(session: Session) -> None:
     starts_ns = [
         mark.time_ns
         for mark in session.steps()
-        if mark.kind == "PowerCamera" and mark.parameters["on"] and mark.state is StepState.STARTED
+        if mark.kind == "power_camera" and mark.parameters["on"] and mark.state is StepState.STARTED
     ]
     for start_ns, (time_ns, _) in zip(starts_ns, (own[0], own[3]), strict=True):
         assert (time_ns - start_ns) / 1e9 < 8.0
@@ -115,9 +115,9 @@ def check_places(session: Session) -> None:
     for mark in session.steps():
         if mark.state is not StepState.DONE:
             continue
-        if mark.kind == "MoveTo":
+        if mark.kind == "move_to":
             table[str(mark.parameters["axis"])] = float(str(mark.parameters["position"]))
-        if mark.kind == "Capture":
+        if mark.kind == "capture":
             places.append((table["linear"], table["rotary"]))
     poses = [(20.0, 0.0), (25.0, 4.0), (20.0, 0.0)]
     assert places == [(10.0, 0.0)] * 2 + [(10.0, -5.0), (10.0, 5.0), (30.0, -5.0)] + poses * 2

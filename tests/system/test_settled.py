@@ -47,7 +47,7 @@ async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: P
     reported = [event.text for event in session.events() if event.kind == "settled"]
     assert len(reported) == 1
     assert all("K/min" in text and "mpx/min" in text for text in reported)
-    soaks = [mark for mark in session.steps() if mark.kind == "SoakUntilSettled"]
+    soaks = [mark for mark in session.steps() if mark.kind == "soak_until_settled"]
     assert [mark.state for mark in soaks] == [StepState.STARTED, StepState.DONE]
     begin, end = soaks
     soak_s = (end.time_ns - begin.time_ns) / NS_PER_S
@@ -80,5 +80,5 @@ async def test_a_dwell_that_never_settles_ends_at_its_longest_and_says_so(tmp_pa
     reported = [event for event in session.events() if event.kind in ("settled", "not_settled")]
     assert [(event.kind, event.level) for event in reported] == [("not_settled", "warning")]
     assert reported[0].text.startswith("not settled after 15 min: ")
-    begin, end = (mark for mark in session.steps() if mark.kind == "SoakUntilSettled")
+    begin, end = (mark for mark in session.steps() if mark.kind == "soak_until_settled")
     assert 900.0 <= (end.time_ns - begin.time_ns) / NS_PER_S < 915.0

@@ -85,7 +85,7 @@ def test_an_interrupted_run_of_two_cameras_is_resumed(tmp_path: Path):
     for number, name in ((2, "side"), (1, "camera")):
         camera = {"address": f"127.0.0.2{number}", "serial_number": f"TS-000{number}", "width_px": 64, "height_px": 64}
         data["cameras"][name] = {**camera, "boot_s": 4.0, "poll_s": 5.0}
-    stopped = at_step("CloseFlap", lambda: os.kill(os.getpid(), signal.SIGINT))
+    stopped = at_step("close_flap", lambda: os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(Interrupted):
         asyncio.run(run_virtual(order(data, CAPTURES), tmp_path, 1, stopped))
     (directory,) = tmp_path.glob("*-captures")

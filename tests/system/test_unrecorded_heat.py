@@ -75,7 +75,7 @@ async def heating(order: Order, out: Path) -> AsyncIterator[tuple[asyncio.Task[P
 
     def watch(hub) -> None:
         hub.subscribe(watcher)
-        at_step("Soak", soaking.set)(hub)
+        at_step("soak", soaking.set)(hub)
 
     task = asyncio.create_task(run_real(order, out, watch))
     started = asyncio.create_task(soaking.wait())
@@ -221,7 +221,7 @@ async def test_a_lack_of_memory_is_said_in_words(
                 raise MemoryError
 
         hub.subscribe(listen)
-        at_step("Soak", lambda: hungry.append(True))(hub)
+        at_step("soak", lambda: hungry.append(True))(hub)
 
     with pytest.raises(StandError, match="out of memory"):
         await asyncio.wait_for(run_real(replace(ordered), tmp_path / "out", watch), LIMIT_S)

@@ -171,9 +171,9 @@ def _holds(evidence: Evidence) -> Iterator[tuple[int, int]]:
 def flap_is_open_for_captures_only(evidence: Evidence) -> Iterator[str]:
     """From the begin of a step that opens it (a look in a soak, too) to the end of the one that closes it."""
     opens = sorted(
-        (mark.time_ns, mark.kind != "CloseFlap" or mark.state != "done")
+        (mark.time_ns, mark.kind != "close_flap" or mark.state != "done")
         for mark in evidence.marks
-        if mark.kind in ("OpenFlap", "CloseFlap", "SoakUntilSettled")
+        if mark.kind in ("open_flap", "close_flap", "soak_until_settled")
     )
     times_ns = [time_ns for time_ns, _ in opens]
     for truth in evidence.truth if "flap" in evidence.stand else ():
@@ -288,7 +288,7 @@ def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
         fault.name.startswith("camera") for fault in evidence.case.faults
     )
     for mark in evidence.marks:
-        if mark.kind == "Capture" and mark.state == "done" and mark.step_id not in skipped | lost:
+        if mark.kind == "capture" and mark.state == "done" and mark.step_id not in skipped | lost:
             cameras = len(mark.parameters.get("cameras", ())) or len(evidence.stand["cameras"])
             found, wanted = taken[mark.step_id], mark.parameters["frames"] * cameras
             if evidence.is_complete and (found < wanted or (found > wanted and not is_lossy)):
@@ -312,9 +312,9 @@ def journal_and_recording_agree(evidence: Evidence) -> Iterator[str]:
 def frames_are_at_their_temperature(evidence: Evidence) -> Iterator[str]:
     """The air is within the soaks' band and what its sensor may be off, or the frame says `unsettled`. Each capture
     of a case has a soak before it, which somebody may have left out."""
-    wanted = {mark.step_id: mark.parameters.get("chamber_degC") for mark in evidence.marks if mark.kind == "Capture"}
+    wanted = {mark.step_id: mark.parameters.get("chamber_degC") for mark in evidence.marks if mark.kind == "capture"}
     soaks = sorted(
-        (mark.time_ns, mark.parameters.get("duration_s", SHORT_S)) for mark in evidence.marks if "Soak" in mark.kind
+        (mark.time_ns, mark.parameters.get("duration_s", SHORT_S)) for mark in evidence.marks if "soak" in mark.kind
     )
     for time_ns, step_id, flags in evidence.metas:
         before = soaks[max(0, bisect.bisect_right(soaks, (time_ns, math.inf)) - 1)] if soaks else (0, SHORT_S)

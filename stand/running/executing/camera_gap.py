@@ -116,7 +116,7 @@ def settled_offsets(session: Session) -> dict[float, float]:
     readings = [session.readings(channel) for channel in (CAMERA, AIR)]
     for mark in session.steps():
         chamber_degC, role = mark.parameters.get("chamber_degC"), mark.parameters.get("role")
-        if mark.kind != "Capture" or mark.state is not StepState.STARTED or role in _TRANSIENT_ROLES:
+        if mark.kind != "capture" or mark.state is not StepState.STARTED or role in _TRANSIENT_ROLES:
             continue
         camera, air = (
             values[(times_ns > mark.time_ns - _WINDOW_S * NS_PER_S) & (times_ns <= mark.time_ns) & np.isfinite(values)]
@@ -179,7 +179,7 @@ def camera_before(session: Session) -> CameraBefore:
             lost, lost_ns = "its equilibrium had been lost before", event.time_ns
         elif event.kind == CAMERA_EQUILIBRIUM:
             lost = ""
-    if any(mark.kind == "PowerCamera" and mark.time_ns > lost_ns for mark in session.steps()):
+    if any(mark.kind == "power_camera" and mark.time_ns > lost_ns for mark in session.steps()):
         lost = ""  # by the plan, which soaks it as it needs it
     if CAMERA not in session.channels():  # a stand without a camera, or one that has reported nothing yet
         return CameraBefore(None, boot_id, lost)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.known import Answer, Enough, Undecided, Visit, after_decision, fixed_visits
-from experiments.steps import Decide, PlannedStep, kind_of, parameters_of
+from experiments.steps import Decide, PlannedStep
 from foundation.calls import Lane
 from foundation.clock import Clock
 from foundation.errors import StandError
@@ -80,7 +80,7 @@ class Decider:
         """In the lane."""
         line = helper.line(_LINE)
         line.make(_KEPT, importlib.import_module, self._module)
-        return line.call(_KEPT, "decided", str(self._directory), parameters_of(decide))
+        return line.call(_KEPT, "decided", str(self._directory), decide.parameters)
 
 
 def _decided(found: Mapping[str, Any]) -> Decided:
@@ -103,7 +103,7 @@ def change_of_plan(state: RunState, planned: PlannedStep, decided: Decided, time
     about."""
     step = planned.step
     if not isinstance(step, Decide):
-        raise ValueError(f"{kind_of(step)} decides nothing")
+        raise ValueError(f"{step.kind} decides nothing")
     first = planned.index + 1
     fixed = fixed_visits(step)
     there = tuple(each.step for each in state.plan[first : first + len(fixed)])

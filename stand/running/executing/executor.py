@@ -15,23 +15,9 @@ from contextlib import contextmanager
 from experiments.known import Undecided
 from experiments.steps import (
     Capture,
-    CheckHome,
-    CloseFlap,
-    CoolDown,
     Decide,
-    MoveTo,
-    OpenFlap,
     PlannedStep,
-    PowerCamera,
-    Prompt,
     Role,
-    SetTemperature,
-    Soak,
-    SoakUntilSettled,
-    StartChamber,
-    StopChamber,
-    kind_of,
-    parameters_of,
 )
 from experiments.steps import Step as PlanStep
 from foundation.clock import NS_PER_S, Clock
@@ -220,7 +206,7 @@ class Executor:
                     raise
             planned = self._state.step(self._state.under_way)
             if planned is not None and not is_readying:
-                self._log.tell(STEP_BROKEN_OFF, str(error), step=kind_of(planned.step))
+                self._log.tell(STEP_BROKEN_OFF, str(error), step=planned.step.kind)
                 self._log.enter(Due(self._clock.now_ns(), None))
             return False
         return True
@@ -287,35 +273,9 @@ class Executor:
         await self._log.write(Again(now_ns, step_ids, frames_lost))
 
     async def _perform(self, planned: PlannedStep) -> None:
-        stand = self._stand
-        match planned.step:
-            case StartChamber(chamber_degC):
-                await stand.chamber.start(chamber_degC)
-            case SetTemperature(chamber_degC):
-                await stand.chamber.set_temperature(chamber_degC)
-            case StopChamber():
-                await stand.chamber.stop()
-            case OpenFlap():
-                await stand.imaging.open_flap()
-            case CloseFlap():
-                await stand.imaging.close_flap()
-            case MoveTo(axis, position):
-                await stand.table.move_to(axis, position)
-            case PowerCamera(on):
-                supply = stand.imaging.supply
-                supply.equilibrium.forget()
-                await (supply.switch_on() if on else supply.switch_off())
-            case CoolDown(band_K, time_constant_s, max_s):
-                cooling = stand.imaging.supply.cool_down(band_K, time_constant_s, max_s)
-                await self._unless_skipped(planned.step_id, cooling)
-            case CheckHome(axis):
-                await stand.table.check_home(axis)
-            case Prompt(text):
-                await self._unless_skipped(planned.step_id, stand.prompt(text))
-            case Decide():
-                await self._unless_skipped(planned.step_id, self._decide(planned, planned.step))
-            case Soak() | SoakUntilSettled() | Capture():
-                pass  # are earned and taken
+        step = planned.step
+        work = self._decide(planned, step) if isinstance(step, Decide) else step.perform(self._stand)
+        await (self._unless_skipped(planned.step_id, work) if step.ends_when_skipped else work)
 
     async def _decide(self, planned: PlannedStep, step: Decide) -> None:
         """Not again after a kill between the decision and the end of the step."""
@@ -370,5 +330,5 @@ class Executor:
         self._log.enter(Cooled(self._clock.now_ns()))
 
     def _mark(self, planned: PlannedStep, state: StepState) -> None:
-        now_ns, kind = self._clock.now_ns(), kind_of(planned.step)
-        self._hub.publish(StepMark(now_ns, planned.step_id, planned.index, kind, state, parameters_of(planned.step)))
+        now_ns, step = self._clock.now_ns(), planned.step
+        self._hub.publish(StepMark(now_ns, planned.step_id, planned.index, step.kind, state, step.parameters))

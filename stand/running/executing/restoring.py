@@ -19,6 +19,9 @@ async def restore(
     """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
     disturbances = log.state.disturbances
     await stand.imaging.close_flap()
+    for planned in set_up.others.values():
+        await stand.gate.passed()
+        await planned.step.perform(stand)
     for axis, position in set_up.positions.items():
         await stand.gate.passed()
         await stand.table.move_to(axis, position)
@@ -26,8 +29,7 @@ async def restore(
     if set_up.camera_on:
         await stand.imaging.supply.restore()
     else:
-        stand.imaging.supply.equilibrium.forget()
-        await stand.imaging.supply.switch_off()
+        await stand.imaging.power_camera(on=False)
     if set_up.chamber_degC is not None:
         await stand.gate.passed()
         worth, now_ns = worth_of_soaks(log.state, set_up, surroundings()), clock.now_ns()

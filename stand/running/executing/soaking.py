@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from experiments.steps import AnySoak, PlannedStep, Soak, band_K_of, last_part_s
+from experiments.steps import AnySoak, PlannedStep, Soak
 from foundation.clock import NS_PER_S, Clock, seconds_ns
 from foundation.errors import DeviceFault
 from foundation.events import SOAK_LONGER, SOAK_UNSETTLED
@@ -90,10 +90,10 @@ class Soaking:
     def _missing_s(self, step: AnySoak) -> float:
         """What the chamber was not in the band in the last part before now, s; 0 also when the soak has no band, or the
         chamber is stopped."""
-        band_K, chamber_degC = band_K_of(step), self._state.set_up.chamber_degC
+        band_K, chamber_degC = step.guaranteed_K, self._state.set_up.chamber_degC
         if not band_K or chamber_degC is None:
             return 0.0
-        return max(0.0, last_part_s(step) - self._settling.in_band_s(chamber_degC, band_K))
+        return max(0.0, step.last_part_s - self._settling.in_band_s(chamber_degC, band_K))
 
     def _tell_longer(self, step: Soak, soak: PlannedStep, soaked_s: float) -> float:
         """That it goes on beyond its time; returned is for how long at least, s."""
@@ -103,8 +103,7 @@ class Soaking:
 
     def _text(self, step: AnySoak) -> str:
         """Where the chamber was."""
-        chamber_degC, last_s = self._state.set_up.chamber_degC, last_part_s(step)
+        chamber_degC, last_s = self._state.set_up.chamber_degC, step.last_part_s
         was_s = last_s - self._missing_s(step)
-        return (
-            f"the chamber was within {band_K_of(step):g} K of {chamber_degC} degC for {was_s:.0f} s, not {last_s:.0f} s"
-        )
+        place = f"within {step.guaranteed_K:g} K of {chamber_degC} degC"
+        return f"the chamber was {place} for {was_s:.0f} s, not {last_s:.0f} s"

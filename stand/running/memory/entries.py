@@ -36,7 +36,6 @@ from typing import Literal, cast
 from pydantic import TypeAdapter, ValidationError
 
 from experiments.steps import Step as PlanStep
-from experiments.steps import kind_of, parameters_of
 from foundation.document_faults import path_text
 from foundation.errors import SessionError
 from recording.reading.journal_lines import JOURNAL_NAME
@@ -210,7 +209,7 @@ _WRITTEN: dict[str, type[Written]] = {
 
 def edited(time_ns: int, from_index: int, steps: Iterable[PlanStep], decided: str = "", reason: str = "") -> Edited:
     """The steps from a place on replaced by these."""
-    by: list[dict[str, object]] = [{"kind": kind_of(step), "parameters": parameters_of(step)} for step in steps]
+    by: list[dict[str, object]] = [{"kind": step.kind, "parameters": step.parameters} for step in steps]
     return Edited(time_ns, from_index, by, decided, reason)
 
 

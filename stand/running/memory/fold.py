@@ -15,12 +15,8 @@ from types import MappingProxyType
 
 from experiments.steps import (
     AnySoak,
-    CheckHome,
     PlannedStep,
     PowerCamera,
-    Soak,
-    is_setup,
-    kind_of,
     number_steps,
     step_of,
 )
@@ -110,17 +106,18 @@ def refusal(state: RunState, change: Change) -> str:
     planned = state.step(change.step_id)
     if planned is None:
         return f"the plan has no step {change.step_id}"
-    name = f"step {planned.index + 1} ({kind_of(planned.step)})"
+    name = f"step {planned.index + 1} ({planned.step.kind})"
     if change.step_id in state.done:
         return f"{name} is done"
     if isinstance(change, Extended):
         if not isinstance(planned.step, AnySoak):
             return f"{name} is no soak"
         return "" if 0.0 < change.by_s < float("inf") else f"{name} cannot be extended by {change.by_s:g} s"
-    if is_setup(planned.step):
+    if planned.step.is_setup:
         return f"{name} sets up what later steps rely on; replace those from it on"
-    is_moving = isinstance(planned.step, CheckHome) and state.under_way == change.step_id
-    return f"{name} is under way and ends by itself" if is_moving else ""
+    if not planned.step.ends_when_skipped and state.under_way == change.step_id:
+        return f"{name} is under way and ends by itself"
+    return ""
 
 
 def change_text(state: RunState, change: Change) -> str:
@@ -132,7 +129,7 @@ def change_text(state: RunState, change: Change) -> str:
             f"the steps from number {change.from_index + 1} on are replaced by {len(change.by)} others by an operator"
         )
     planned = state.step(change.step_id)
-    name = change.step_id if planned is None else f"step {planned.index + 1} ({kind_of(planned.step)})"
+    name = change.step_id if planned is None else f"step {planned.index + 1} ({planned.step.kind})"
     if isinstance(change, Extended):
         return f"{name} takes {change.by_s:g} s longer, by an operator"
     return f"{name} is left out, by an operator"
@@ -165,14 +162,10 @@ def _mapping(value: object) -> Mapping[str, object]:
 
 
 def _longer(planned: PlannedStep, step_id: str, by_s: float) -> PlannedStep:
-    """One that waits for the camera waits longer at the least and at the most."""
     step = planned.step
     if planned.step_id != step_id or not isinstance(step, AnySoak):
         return planned
-    if isinstance(step, Soak):
-        max_s = None if step.max_s is None else step.max_s + by_s
-        return replace(planned, step=replace(step, duration_s=step.duration_s + by_s, max_s=max_s))
-    return replace(planned, step=replace(step, min_s=step.min_s + by_s, max_s=step.max_s + by_s))
+    return replace(planned, step=step.longer(by_s))
 
 
 def _placed(state: RunState) -> RunState:

@@ -23,8 +23,6 @@ from experiments.steps import (
     SoakUntilSettled,
     StartChamber,
     StopChamber,
-    band_K_of,
-    longest_s,
 )
 from foundation.clock import NS_PER_S, seconds_ns
 from stand.running.memory.entries import Change, Edited, Ended
@@ -42,14 +40,15 @@ class SetUp:
     """What steps have set up, so that it can be brought about again: of each kind only the last counts.
 
     chamber_degC: the set-point, None when the chamber is stopped. positions: axis -> mm or deg. soaks: the soaks since
-    the last set-point, worth something only as long as the chamber stays at it. Before any step the camera is on and
-    the flap closed."""
+    the last set-point, worth something only as long as the chamber stays at it. others: the last step of each kind that
+    another package adds. Before any step the camera is on and the flap closed."""
 
     chamber_degC: float | None = None
     soaks: Plan = ()
     camera_on: bool = True
     flap_open: bool = False
     positions: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    others: Mapping[str, PlannedStep] = field(default_factory=lambda: MappingProxyType({}))
 
     def after(self, planned: PlannedStep) -> SetUp:
         """What it is when that step, too, is done."""
@@ -68,6 +67,8 @@ class SetUp:
                 return replace(self, flap_open=False)
             case MoveTo(axis, position):
                 return replace(self, positions=MappingProxyType({**self.positions, axis: position}))
+            case step if step.is_setup:
+                return replace(self, others=MappingProxyType({**self.others, step.kind: planned}))
             case _:
                 return self
 
@@ -76,6 +77,7 @@ class SetUp:
         """As in `chamber at 30 degC, camera on, flap open, linear at 2`."""
         parts = [f"camera {'on' if self.camera_on else 'off'}", f"flap {'open' if self.flap_open else 'closed'}"]
         parts += [f"{axis} at {position:g}" for axis, position in self.positions.items()]
+        parts += [planned.step.words for planned in self.others.values()]
         chamber = "stopped" if self.chamber_degC is None else f"at {self.chamber_degC:g} degC"
         return f"chamber {chamber}, {', '.join(parts)}"
 
@@ -191,8 +193,8 @@ class RunState:
 
 def duration_of(soak: PlannedStep) -> int:
     """What the soak takes at the most, ns; 0 when it is no soak."""
-    return seconds_ns(longest_s(soak.step)) if isinstance(soak.step, AnySoak) else 0
+    return seconds_ns(soak.step.longest_s) if isinstance(soak.step, AnySoak) else 0
 
 
 def _is_guaranteed(soak: PlannedStep) -> bool:
-    return isinstance(soak.step, AnySoak) and band_K_of(soak.step) > 0.0
+    return isinstance(soak.step, AnySoak) and soak.step.guaranteed_K > 0.0

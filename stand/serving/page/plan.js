@@ -95,7 +95,7 @@ export class Plan {
       h("span", {}, step.text || step.kind, progress_text(step)),
       h("span", { class: "bar" }, step.standing === "under_way" ? bar(step) : null),
       h("span", { class: "number quiet" }, this.when(step)), acts);
-    if (is_open && step.kind.startsWith("Soak")) {
+    if (is_open && step.kind.startsWith("soak")) {
       button("+15 min", () => this.order("extend", { step_id: step.step_id, by_s: 900 }, "extend by 15 min"));
     }
     if (is_open) button("Skip", () => ask(row, `Leave out step ${step.index + 1}, ${step.text || step.kind}?`, "Leave it out", () => this.order("skip", { step_id: step.step_id }, "skip")));
@@ -134,7 +134,7 @@ export class Plan {
     let at_s = 0;
     for (const step of steps) {
       const x = (at_s / total_s) * width, wide = Math.max(1, (step.duration_s / total_s) * width);
-      const is_frames = step.kind.startsWith("Capture"), is_soak = step.kind.startsWith("Soak") || step.kind === "CoolDown";
+      const is_frames = step.kind.startsWith("capture"), is_soak = step.kind.startsWith("soak") || step.kind === "cool_down";
       const part = { done: 1, skipped: 0, waiting: 0, under_way: earned(step) }[step.standing];
       const top = is_frames ? 4 * scale : is_soak ? 12 * scale : 18 * scale, tall = height - 2 * top;
       context.fillStyle = is_frames ? `${css("--c-air")}88` : css("--line");

@@ -9,7 +9,7 @@ const MOST_ROWS = 200; // with fields; of a longer plan the steps behind stay as
 
 // What only a plan can give cannot be added by hand.
 const is_addable = ({ properties, required }) => properties && !required?.some((name) => properties[name].readOnly);
-const kind_words = (kind) => kind.replace(/([a-z])([A-Z])/g, "$1 $2").toLowerCase();
+const kind_words = (kind) => kind.replaceAll("_", " ");
 
 export class PlanEdit {
   // steps: those of the plan from `from_index` on. axes: name and unit. over() is called when nothing is edited any more.
@@ -20,7 +20,7 @@ export class PlanEdit {
     this.rows = steps.slice(0, MOST_ROWS).map((step) => this.row(step.kind, step.parameters, step.step_id, step.text));
     this.whole = h("p", { class: "answer", role: "status" });
     this.kind = h("select", { "aria-label": "Kind of step to add" }, Object.keys(schema.$defs).filter((kind) => is_addable(schema.$defs[kind])).map((kind) => h("option", { value: kind }, kind_words(kind))));
-    this.kind.value = "Soak";
+    this.kind.value = "soak";
     this.head = h("h3", { tabindex: "-1" });
     fill(place, h("div", { class: "ask", role: "group", "aria-label": "Steps to come" }, this.head, this.list,
       this.kept.length ? h("p", { class: "quiet" }, `${this.kept.length} more steps behind these stay as they are.`) : null,

@@ -1,0 +1,139 @@
+"""A kind of step that another package adds is found everywhere by its one class."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import yaml
+
+from experiments.steps import STEPS, Soak, StartChamber, Step, number_steps, schema_of_steps, step_of, words_of
+from foundation.clock import NS_PER_S
+from foundation.documents import parse_document
+from foundation.errors import ConfigError
+from foundation.items import Event, StepMark
+from stand.config.recipe import Recipe
+from stand.config.stand_config import load_config, packaged
+from stand.estimating.estimate import price
+from stand.gate import INTERLOCK
+from stand.running.memory.entries import Skipped, decoded, edited, encoded
+from stand.running.memory.fold import refusal
+from stand.running.memory.state import RunState
+from tests.stand.small_stand import Life
+
+MODULE = '''
+from dataclasses import dataclass
+from typing import Annotated
+from pydantic import Field
+from experiments.steps import Price, Step
+
+@dataclass(frozen=True, slots=True)
+class LampOn(Step):
+    """The lamp beside the target, at so many percent."""
+    kind = "lamp_on"
+    is_setup = True
+    says = "lamp at {percent:g} %"
+    form = Annotated[float, Field(ge=0, le=100)]
+    percent: float
+
+    def refused(self, stand):
+        return "the lamp stands too near the camera" if self.percent > 90 else ""
+
+    def price(self, found, stand):
+        return Price(self.kind, 4.0)
+
+    async def perform(self, stand):
+        PERFORMED.append(self.percent)
+        await stand.table.check_home("lamp")
+
+PERFORMED = []
+'''
+START_NS = 1_767_290_400 * NS_PER_S
+
+
+@pytest.fixture
+def lamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The package, installed; nothing of this program knows it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "acme_lamp.py").write_text(MODULE)
+    info = tmp_path / "acme_lamp-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-lamp\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[thermostand.steps]\nlamp_on = acme_lamp:LampOn\nno_lamp = acme_none:No\n")
+    yield
+    STEPS.pop("lamp_on", None)
+    sys.modules.pop("acme_lamp", None)
+
+
+def recipe(*entries: object) -> Recipe:
+    return parse_document(yaml.safe_dump({"name": "own", "steps": list(entries)}), Recipe, "own.yaml")
+
+
+@pytest.mark.usefixtures("lamp")
+def test_a_recipe_names_it_and_its_values_are_checked():
+    (_, planned) = recipe({"start_chamber": 24.0}, {"lamp_on": 40.0}).plan()
+    assert (planned.step.kind, planned.step.parameters) == ("lamp_on", {"percent": 40.0})
+    with pytest.raises(ConfigError, match=r"own.yaml: steps.1.lamp_on: must be less than or equal to 100"):
+        recipe({"lamp_on": 140.0})
+    with pytest.raises(ConfigError, match=r"own.yaml: steps.1: lamp_on needs a value behind its colon"):
+        recipe("lamp_on")
+    with pytest.raises(ConfigError, match=r"no_lamp: acme-lamp 1.0 cannot be loaded .*; reinstall it"):
+        recipe("no_lamp")
+
+
+@pytest.mark.usefixtures("lamp")
+def test_it_has_its_words_its_price_its_form_and_its_limits():
+    config = load_config(packaged("", "simulated"))
+    step = step_of("lamp_on", {"percent": 40.0})
+    assert (step.words, words_of("lamp_on", {"percent": 40.0})) == ("lamp at 40 %", "lamp at 40 %")
+    assert [each.duration_s for each in price(number_steps([step]), config)] == [4.0]
+    with pytest.raises(ConfigError, match=r"step 1 \(lamp_on\): the lamp stands too near the camera"):
+        price(number_steps([step_of("lamp_on", {"percent": 95.0})]), config)
+    assert cast("dict[str, Any]", schema_of_steps()["$defs"])["lamp_on"]["required"] == ["percent"]
+    entry = Recipe.model_json_schema()["$defs"]["StepEntry"]["properties"]["lamp_on"]
+    assert (entry["anyOf"][0]["minimum"], entry["anyOf"][0]["maximum"]) == (0, 100)
+
+
+@pytest.mark.usefixtures("lamp")
+def test_the_journal_keeps_it_and_a_plan_that_is_changed_has_it():
+    steps = (StartChamber(24.0), step_of("lamp_on", {"percent": 40.0}))
+    change = edited(START_NS, 0, steps)
+    assert decoded(encoded(change)) == change
+    state = RunState(tuple(number_steps(steps)))
+    assert "sets up what later steps rely on" in refusal(state, Skipped(START_NS, state.plan[1].step_id))
+
+
+@pytest.mark.usefixtures("lamp")
+def test_it_is_performed_recorded_and_restored_after_a_hold(tmp_path: Path):
+    plan = tuple(number_steps([StartChamber(24.0), step_of("lamp_on", {"percent": 40.0}), Soak(60.0, band_K=0.0)]))
+    (tmp_path / "life").mkdir()
+    life = Life(tmp_path / "life", plan, START_NS, [], 24.0, follows=True)
+    reported: list[object] = []
+    life.hub.subscribe(reported.append)
+    try:
+        life.passes(10.0)
+        marks = [item for item in reported if isinstance(item, StepMark) and item.kind == "lamp_on"]
+        assert [(mark.state, mark.parameters) for mark in marks] == [
+            ("started", {"percent": 40.0}),
+            ("done", {"percent": 40.0}),
+        ]
+        life.interlock()
+        life.call(lambda: life.stand.gate.clear(INTERLOCK))
+        life.passes(60.0)
+    finally:
+        life.kill()
+    assert sys.modules["acme_lamp"].PERFORMED == [40.0, 40.0]
+    restored = [item.text for item in reported if isinstance(item, Event) and item.kind == "restored"]
+    assert [text.rpartition(", ")[2] for text in restored] == ["lamp at 40 %"]
+
+
+def test_a_kind_states_whether_it_sets_up():
+    with pytest.raises(TypeError, match="Half is a step and has to state is_setup"):
+
+        @dataclass(frozen=True)
+        class Half(Step):
+            kind = "half"
+
+    assert "half" not in STEPS
