@@ -63,7 +63,7 @@ from tests.torture.lives import HIDDEN, ROOT, Life, find_folder
 BUSY_S = 40.0  # in which things break
 AFTER_S = 7.0
 LIMIT_S, LEAVES_S = 240.0, 60.0  # until the plan is complete, all else mended; until a daemon has left
-LOOK_S, AGAIN_S = 0.5, 1.0  # of the operator; until the daemon is started again
+LOOK_S, AGAIN_S, CLEARS_EACH_S = 0.5, 1.0, 5.0  # of the operator; until the daemon is started again; between two clears
 MOST_ORDERS, MOST_KILLS = 6, 2
 PRESSED_S = 10.0  # after which a STOP is given up
 DISK_BYTES = 6 << 30
@@ -318,7 +318,7 @@ class Bench:
         self.disk, self._folder = disk, folder
         self.port, self.secop = free_port(), free_port()
         self.step_ns = self._offset_ns = self._laboratories = self._daemons = 0
-        self._over, self._late_s, self._opened_ns = threading.Event(), 0.0, 0
+        self._over, self._late_s, self._opened_ns, self._clears_s = threading.Event(), 0.0, 0, 0.0
         self._is_done = self._is_quiet = False
         self._stopped = Counter[int]()
         self.daemon: subprocess.Popen[str]
@@ -509,7 +509,10 @@ class Bench:
             text = (self._folder / "plan.yaml").read_text()
             self.doors.asked("POST", "queue", {"recipe_text": text, "key": f"torture-{len(state['queue'])}"})
         elif state["fault"] or state["queue_halted"]:
-            self.doors.asked("POST", "run/clear", {})
+            # Who clears has looked: not while the folder is away, and not twice a second while a fault lasts.
+            if time.monotonic() >= self._clears_s and not any((self.disk / HIDDEN).iterdir()):
+                self._clears_s = time.monotonic() + CLEARS_EACH_S
+                self.doors.asked("POST", "run/clear", {})
         elif last["state"] in ("failed", "stopped", "interrupted"):
             self.doors.asked("POST", f"sessions/{last['session']}/resume", {})
         elif self._is_quiet and state["phase"] == "held":
