@@ -80,7 +80,8 @@ def _gram(g: Float, label: Index, rows_of: Index) -> Float:
 
 def _labels(observations: Observations, rows: Displacements) -> Index:
     """(M,): the instant of each row, from 0."""
-    _, step = np.unique(np.array(observations.step_id), return_inverse=True)
+    _, first, step = np.unique(np.array(observations.step_id), return_index=True, return_inverse=True)
+    step = np.argsort(np.argsort(first))[step]  # as they came: an order of ids would move a fit's last digits
     part = observations.time_ns // INSTANT_NS
     key = np.column_stack([observations.session, step, part])[rows.frame]
     return np.unique(key, axis=0, return_inverse=True)[1].ravel()

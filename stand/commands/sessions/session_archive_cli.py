@@ -75,7 +75,7 @@ def archive_sessions(
 
 @dataclass
 class _Done:
-    """What became of the sessions, by name. gone: whose copy is there no more; due: those that the rule would delete."""
+    """What became of the sessions, by name. gone: whose copy is gone; due: those that the rule would delete."""
 
     copied: dict[str, Path] = field(default_factory=dict[str, Path])
     waiting: dict[str, str] = field(default_factory=dict[str, str])

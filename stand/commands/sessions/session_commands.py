@@ -13,7 +13,9 @@ app = lazy_app(
         "list": Lazy(_LIST, "The sessions in a folder: when, how long, how they ended, tags and notes."),
         "note": Lazy(_LIST, "Add a note to a session, also while it runs."),
         "tag": Lazy(_LIST, "Give a session tags, or take them away."),
-        "archive": Lazy("stand.commands.sessions.session_archive_cli", "Copy finished sessions to another disk, read back."),
+        "archive": Lazy(
+            "stand.commands.sessions.session_archive_cli", "Copy finished sessions to another disk, read back."
+        ),
         "info": Lazy(_WORK, "What a session holds: when, steps, frames, gaps, temperatures, events, versions."),
         "verify": Lazy(_WORK, "Read every byte of a session and say what is damaged or missing."),
         "salvage": Lazy(_WORK, "Finish unfinished segments and repair damaged ones."),

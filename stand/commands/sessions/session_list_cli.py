@@ -79,7 +79,9 @@ def _show_table(seen: list[Entry]) -> None:
     table = Table(box=None, pad_edge=False)
     for column in columns:
         is_name = column == columns[0]
-        table.add_column(column, justify="right" if column in ON_THE_RIGHT else "left", overflow="fold", no_wrap=is_name)
+        table.add_column(
+            column, justify="right" if column in ON_THE_RIGHT else "left", overflow="fold", no_wrap=is_name
+        )
     for row in cells:
         named = zip(columns, row, strict=True)
         table.add_row(
