@@ -75,8 +75,12 @@ class EventKind(str):
     cases: tuple[Data, ...]
 
     def at(self, time_ns: int, said: str = "", /, **data: object) -> Event:
-        """One that has happened at that instant. KeyError when the text needs a field that is not given."""
-        return Event(time_ns, self.level_of(data), str(self), self.sentence(said, **data), data)
+        """One that has happened at that instant."""
+        try:
+            text = self.sentence(said, **data)
+        except (LookupError, TypeError, ValueError):  # what is told must not end what tells it: a keeper, a night
+            text = ", ".join([said or str(self), *(f"{name} {value}" for name, value in data.items())])
+        return Event(time_ns, self.level_of(data), str(self), text, data)
 
     def level_of(self, data: Data) -> Level:
         """How grave it is with such data."""
@@ -87,7 +91,7 @@ class EventKind(str):
         return self.alert(data) if callable(self.alert) else self.alert
 
     def sentence(self, said: str = "", /, **data: object) -> str:
-        """Its text alone."""
+        """Its text alone. LookupError, TypeError or ValueError when a field is not given, or is none that fits."""
         if callable(self.text):
             return self.text(said=said, **data)
         return _FORM.vformat(self.text, (), {"said": said, **data})

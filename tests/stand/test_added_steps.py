@@ -137,3 +137,14 @@ def test_a_kind_states_whether_it_sets_up():
             kind = "half"
 
     assert "half" not in STEPS
+
+
+def test_a_kind_is_one_word_as_recipes_write_it():
+    with pytest.raises(TypeError, match="its kind 'LampOff' has to be one word, as in move_to"):
+
+        @dataclass(frozen=True)
+        class LampOff(Step):
+            kind = "LampOff"
+            is_setup = True
+
+    assert "LampOff" not in STEPS

@@ -84,6 +84,15 @@ def test_a_rule_of_the_guard_that_is_added_has_its_row():
         del KINDS[GUARD + name]
 
 
+@pytest.mark.parametrize(
+    "data", [{}, {"lamp": "left"}, {"lamp": "left", "lit_s": "long"}, {"lamp": "left", "lit_s": None}]
+)
+def test_a_text_that_cannot_be_made_loses_no_event(lamp: EventKind, data: dict[str, object]):
+    told = lamp.at(7, "the fuse", **data)
+    assert (told.time_ns, told.level, told.kind, told.data) == (7, "warning", "lamp.broken", data)
+    assert told.text == ", ".join(["the fuse", *(f"{name} {value}" for name, value in data.items())])
+
+
 def test_a_name_is_taken_once():
     with pytest.raises(ValueError, match="device_lost"):
         event("device_lost", "info", "again")
