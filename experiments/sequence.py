@@ -24,8 +24,8 @@ def faults(steps: Iterable[Written]) -> Iterator[tuple[Written, str]]:
     found, captures = Situation(), 0
     for count, written in enumerate(steps):
         captures += isinstance(written.step, Capture)
-        fault = written.step.misplaced(found)
+        fault = written.step.placement_fault(found)
         if count >= MOST_STEPS or captures > MOST_CAPTURES:
             fault = f"the plan has more than {MOST_STEPS} steps or {MOST_CAPTURES} captures here; repeat less often"
-        found = written.step.leaves(found)
+        found = written.step.situation_after(found)
         yield written, fault

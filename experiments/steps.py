@@ -190,7 +190,7 @@ def usual_s(steps: Iterable[Step]) -> float:
     found, total_s = Situation(), 0.0
     for step in steps:
         total_s += step.price(found, KnownStand()).duration_s
-        found = step.leaves(found)
+        found = step.situation_after(found)
     return total_s
 
 
@@ -252,12 +252,12 @@ class Step:
         """Why its fields do not go together, as a clause; "" when they do."""
         return ""
 
-    def misplaced(self, found: Situation) -> str:
+    def placement_fault(self, found: Situation) -> str:
         """Why it cannot follow the steps before it, and what to do; "" when it can."""
         del found
         return ""
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         """Why it is nothing for this stand, or outside its limits; "" when the stand can do it. Raises ConfigError
         where a name is unknown."""
         del stand
@@ -268,7 +268,7 @@ class Step:
         del found, stand
         return Price(self.kind, 0.0)
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         """What is different when it is done."""
         return found
 
@@ -284,19 +284,19 @@ class _SetPoint:
     kind: ClassVar[str]
     chamber_degC: float
 
-    def misplaced(self, found: Situation) -> str:
+    def placement_fault(self, found: Situation) -> str:
         del found
         if COLDEST_degC <= self.chamber_degC <= WARMEST_degC:
             return ""
         return f"a set-point of {self.chamber_degC:g} degC; give {COLDEST_degC:g} to {WARMEST_degC:g} degC"
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         return stand.set_point_fault(self.chamber_degC)
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
         return Price(self.kind, stand.set_point_way_s(found.to_degC, self.chamber_degC))
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         degC = self.chamber_degC
         return replace(found, set_point_degC=degC, from_degC=found.to_degC, to_degC=degC, soaked_s=0.0)
 
@@ -325,8 +325,8 @@ class SetTemperature(_SetPoint, Step):
     form = Chamber_degC
     chamber_degC: float
 
-    def misplaced(self, found: Situation) -> str:
-        if fault := _SetPoint.misplaced(self, found):
+    def placement_fault(self, found: Situation) -> str:
+        if fault := _SetPoint.placement_fault(self, found):
             return fault
         stopped = "the chamber is stopped here; start_chamber sets its set-point and lets it heat and cool"
         return stopped if found.set_point_degC is None else ""
@@ -343,7 +343,7 @@ class StopChamber(Step):
     is_setup = True
     says = "stop the chamber"
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         return replace(found, set_point_degC=None)
 
     async def perform(self, stand: PerformingStand) -> None:
@@ -437,7 +437,7 @@ class Soak(Step):
             return f"last_s {self.last_s:g} is its last part; it must be at most duration_s {self.duration_s:g}"
         return ""
 
-    def misplaced(self, found: Situation) -> str:
+    def placement_fault(self, found: Situation) -> str:
         return _aired(found, self.longest_s)
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
@@ -448,7 +448,7 @@ class Soak(Step):
         settled_s = arrival_s - found.soaked_s + self.last_part_s
         return Price(self.kind, min(self.longest_s, max(self.duration_s, settled_s)))
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         return replace(found, soaked_s=found.soaked_s + self.duration_s)
 
 
@@ -535,7 +535,7 @@ class SoakUntilSettled(Step):
         """One that waits longer at the least and at the most."""
         return replace(self, min_s=self.min_s + by_s, max_s=self.max_s + by_s)
 
-    def misplaced(self, found: Situation) -> str:
+    def placement_fault(self, found: Situation) -> str:
         if not found.camera_on:
             return _CAMERA_OFF
         if found.set_point_degC is None:
@@ -544,7 +544,7 @@ class SoakUntilSettled(Step):
             return f"the looks of a soak until settled have the role settling, not {self.role}"
         return _aired(found, self.longest_s) or _mislabelled(self.chamber_degC, found)
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         return stand.exposure_fault(self.chamber_degC) or stand.camera_fault()
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
@@ -600,7 +600,7 @@ class OpenFlap(Step):
     def price(self, found: Situation, stand: KnownStand) -> Price:
         return _flap_price(not found.flap_open)
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         return replace(found, flap_open=True)
 
     async def perform(self, stand: PerformingStand) -> None:
@@ -618,7 +618,7 @@ class CloseFlap(Step):
     def price(self, found: Situation, stand: KnownStand) -> Price:
         return _flap_price(found.flap_open)
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         return replace(found, flap_open=False)
 
     async def perform(self, stand: PerformingStand) -> None:
@@ -677,7 +677,7 @@ class Capture(Step):
     def frame_count(self) -> int:
         return self.frames
 
-    def misplaced(self, found: Situation) -> str:
+    def placement_fault(self, found: Situation) -> str:
         if not found.camera_on:
             return _CAMERA_OFF
         if self.role is Role.SETTLING:
@@ -686,7 +686,7 @@ class Capture(Step):
             return f"the flap is closed here, and {self.role} frames show the target; give open_flap before it"
         return _mislabelled(self.chamber_degC, found)
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         interval_s = self.interval_s if self.frames > 1 else None
         return (
             stand.exposure_fault(self.chamber_degC)
@@ -697,7 +697,7 @@ class Capture(Step):
     def price(self, found: Situation, stand: KnownStand) -> Price:
         return Price(self.kind, (self.frames - 1) * self.interval_s + self.exposure_s)
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         return replace(found, camera_was_on=True)
 
 
@@ -721,7 +721,7 @@ class MoveTo(Step):
     def of_form(cls, value: Mapping[str, float], at_degC: float | None) -> Iterable[Step]:
         return (cls(axis, position) for axis, position in value.items())
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         return stand.axis_fault(self.axis, self.position)
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
@@ -730,7 +730,7 @@ class MoveTo(Step):
             return Price(f"home and move {self.axis}", stand.move_s(self.axis, 0.0, self.position), _HOMING_S)
         return Price(f"move {self.axis}", stand.move_s(self.axis, begin, self.position), _MOVE_CONFIRMED_S)
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         return replace(found, positions=MappingProxyType({**found.positions, self.axis: self.position}))
 
     async def perform(self, stand: PerformingStand) -> None:
@@ -750,13 +750,13 @@ class PowerCamera(Step):
     def words(self) -> str:
         return f"camera {'on' if self.on else 'off'}"
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         return stand.camera_fault() or ("" if self.on else stand.supply_fault())
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
         return Price(self.kind, stand.boot_s if self.on else 0.0)
 
-    def leaves(self, found: Situation) -> Situation:
+    def situation_after(self, found: Situation) -> Situation:
         return replace(found, camera_on=self.on, camera_was_on=found.camera_was_on or self.on)
 
     async def perform(self, stand: PerformingStand) -> None:
@@ -804,10 +804,10 @@ class CoolDown(Step):
         """What a camera takes that has been on for an hour, s."""
         return self.time_constant_s * max(0.0, math.log(_CAMERA_EXCESS_K / self.band_K))
 
-    def misplaced(self, found: Situation) -> str:
+    def placement_fault(self, found: Situation) -> str:
         return "the camera is on here; give power_camera: off before it" if found.camera_on else ""
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         return stand.camera_fault()
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
@@ -837,7 +837,7 @@ class CheckHome(Step):
     def of_form(cls, value: Iterable[str], at_degC: float | None) -> Iterable[Step]:
         return (cls(axis) for axis in value)
 
-    def refused(self, stand: KnownStand) -> str:
+    def stand_fault(self, stand: KnownStand) -> str:
         return stand.axis_fault(self.axis, None)
 
     def price(self, found: Situation, stand: KnownStand) -> Price:

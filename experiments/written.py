@@ -203,10 +203,10 @@ def written_steps(entries: Sequence[StepEntry], place: Place, found: Situation) 
             for degC, soak_s in entry.ramp.set_points(found.set_point_degC):
                 for step in (SetTemperature(degC), Soak(soak_s, band_K=0.0)):
                     yield Written(here, step)
-                    found = step.leaves(found)
+                    found = step.situation_after(found)
                 found = yield from written_steps(entry.ramp.steps, (*here, "steps"), found)
         else:
             for step in entry.steps(here, found.set_point_degC):
                 yield Written(here, step)
-                found = step.leaves(found)
+                found = step.situation_after(found)
     return found

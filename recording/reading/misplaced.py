@@ -37,7 +37,7 @@ class PlacedChunk(NamedTuple):
     messages: Counter[int]
 
 
-def misplaced(chunks: Sequence[PlacedChunk], damages: Sequence[Span]) -> list[Span]:
+def find_misplaced_chunks(chunks: Sequence[PlacedChunk], damages: Sequence[Span]) -> list[Span]:
     """Where such sectors are: from the begin of the damage before to the end of the one behind."""
     near = [pair for pair in pairwise(damages) if pair[1].begin - pair[0].end <= SECTOR_BYTES]
     if not near:

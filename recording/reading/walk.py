@@ -37,7 +37,7 @@ from recording.format.mcap_bytes import (
 from recording.format.proof import Contents, claim_of, proven
 from recording.format.summary import read_summary
 from recording.reading.doubt import Doubt
-from recording.reading.misplaced import PlacedChunk, Span, misplaced
+from recording.reading.misplaced import PlacedChunk, Span, find_misplaced_chunks
 from recording.reading.torn import Blocks
 
 WINDOW_BYTES = 4 << 20
@@ -166,7 +166,7 @@ class _Walk:
     def _forget_misplaced(self) -> None:
         found, size = self.found, self._source.size
         torn = [Span(size - found.torn_bytes, size)] if found.torn_bytes else []
-        for wrong in misplaced(self._placed, [*found.damages, *torn]):
+        for wrong in find_misplaced_chunks(self._placed, [*found.damages, *torn]):
             for chunk in self._placed:
                 if wrong.begin <= chunk.begin < wrong.end:
                     found.messages = found.messages - chunk.messages

@@ -139,5 +139,5 @@ class Recipe(Document):
         for number, experiment in enumerate(self.experiments):
             for written in experiment.sequence(("experiments", number), found):
                 yield written
-                found = written.step.leaves(found)
+                found = written.step.situation_after(found)
         yield from written_steps(self.steps, ("steps",), found)

@@ -121,7 +121,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
                 or _unknown(expected.work, learned),
             )
         )
-        found, approach = step.leaves(found), approach.after(step, duration_s)
+        found, approach = step.situation_after(found), approach.after(step, duration_s)
     total_s = sum(step.duration_s for step in priced)
     if total_s > _LONGEST_S:
         raise ConfigError(f"the plan takes {total_s / 86400:.0f} days; more than a year is refused")
@@ -237,7 +237,7 @@ def check_step(planned: PlannedStep, stand: KnownStand) -> None:
     step = planned.step
     where = f"step {planned.index + 1} ({step.kind})"
     try:
-        fault = step.refused(stand)
+        fault = step.stand_fault(stand)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     if fault:

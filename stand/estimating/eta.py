@@ -156,7 +156,7 @@ class Eta:
             found = Situation()
             for planned in number_steps(steps, first):
                 price, step = planned.step.price(found, KnownStand()), planned.step
-                found, stated_s, work = step.leaves(found), price.duration_s, step.kind
+                found, stated_s, work = step.situation_after(found), price.duration_s, step.kind
                 self._overhead_s.setdefault(work, 0.0)
                 self._seen_s.setdefault(work, deque([0.0], _REMEMBERED))
                 self._steps.append(PricedStep(planned, stated_s, step.frame_count, 0.0, work, stated_s))

@@ -103,7 +103,7 @@ def overheads_of(
         if duration_s is not None:
             expected = expect(step, found, stand)
             overheads.append((expected.work, duration_s - expected.stated_s))
-        found = step.leaves(found)
+        found = step.situation_after(found)
     return overheads
 
 

@@ -25,7 +25,7 @@ def steps_of(
     chamber's set-point there, None while it is stopped. Frames that are not said to be at one are at that."""
     found = Situation()
     for planned in plan[:from_index]:
-        found = planned.step.leaves(found)
+        found = planned.step.situation_after(found)
     for written in steps:
         here_degC, parameters = found.set_point_degC, dict[str, object](written.parameters)
         is_labelled = written.kind in STEPS and STEPS[written.kind].at_set_point
@@ -36,7 +36,7 @@ def steps_of(
         except ConfigError as error:
             yield error, here_degC
         else:
-            found = step.leaves(found)
+            found = step.situation_after(found)
             yield step, here_degC
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Literal
 
 from experiments.steps import words_of
-from experiments.words import doing_in_words
 from foundation.clock import Clock, seconds_ns, utc_offset_ns
 from foundation.items import Batch, Event, Item, StepMark
 from foundation.readings import Quality
@@ -134,3 +133,14 @@ class StatusBoard:
         if state != self._state:
             self._state, self._since_ns = state, self._clock.now_ns()
             self._since_utc_offset_ns = utc_offset_ns(self._clock)
+
+
+def doing_in_words(step: str, soaked_again_s: float | None, *, goes_on: bool) -> str:
+    """The step under way, in words, and what it waits for. soaked_again_s: how long a camera that was off has soaked
+    again, None when it need not. goes_on: whether a soak goes on beyond its time."""
+    if goes_on:
+        step = f"{step}, and until the chamber has stayed in its band"
+    if soaked_again_s is None:
+        return step
+    soaking = f"the camera was or may have been off and soaks again, for {soaked_again_s / 60:.0f} min so far"
+    return f"{soaking}; then: {step}" if step else soaking

@@ -9,7 +9,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 from experiments.steps import words_of
-from experiments.words import doing_in_words
 from foundation.clock import NS_PER_S, seconds_ns
 from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, CLOCK_STEP, RUN_BEGINS, TO_AMBIENT
 from foundation.items import Batch, Event, Item, Original, StepMark
@@ -18,6 +17,7 @@ from recording.format.utc_offsets import UtcOffsets, offsets_of
 from stand.estimating.eta import Eta
 from stand.estimating.run_estimate import Night
 from stand.gate import HELD, RELEASED
+from stand.running.status import doing_in_words
 from stand.watching.moment import AIR, CAMERA, SET_POINT, Moment, held_by
 from stand.watching.remedies import next_command
 

@@ -38,7 +38,7 @@ class LampOn(Step):
     form = Annotated[float, Field(ge=0, le=100)]
     percent: float
 
-    def refused(self, stand):
+    def stand_fault(self, stand):
         return "the lamp stands too near the camera" if self.percent > 90 else ""
 
     def price(self, found, stand):

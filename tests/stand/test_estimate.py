@@ -217,7 +217,7 @@ def test_an_axis_that_the_stand_lacks_is_refused(config: StandConfig, step: Step
 
 
 def test_a_situation_is_what_the_steps_before_have_left(config: StandConfig):
-    found = OpenFlap().leaves(MoveTo("linear", 3.0).leaves(Situation()))
+    found = OpenFlap().situation_after(MoveTo("linear", 3.0).situation_after(Situation()))
     assert found == Situation(flap_open=True, positions={"linear": 3.0})
     assert expect(OpenFlap(), found, ConfiguredStand(config)).work == "flap at rest"
 

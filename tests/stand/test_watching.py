@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.live import Live
 
 from experiments.steps import Capture, Role, Soak, number_steps
-from experiments.words import doing_in_words
 from foundation.clock import NS_PER_S
 from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, SOAK_LONGER
 from foundation.items import Batch, Event, StepMark, StepState
@@ -21,6 +20,7 @@ from stand.commands.control_cli import idle_lines
 from stand.config.stand_config import load_config, packaged
 from stand.estimating.estimate import price
 from stand.estimating.run_estimate import Night
+from stand.running.status import doing_in_words
 from stand.serving.desk import HeatByHand, ReadingState, StandState
 from stand.watching.follow import Follow
 from stand.watching.live import Foot, Lines
