@@ -6,6 +6,6 @@ evaluation = evaluate(model, observations)
 report("report.html", observations, model, evaluation)
 """
 
-from foundation.lazy_names import lazy_names
+from thermostand.foundation.lazy_names import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

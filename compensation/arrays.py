@@ -7,14 +7,14 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.history.known_states import Column, history_of
-from compensation.history.thermal_history import History
-from compensation.observations import Float, Observations, SessionFacts
-from compensation.sound_values import LARGEST_SIDE_px, check_centres, check_degC
-from experiments.steps import Role
-from foundation.clock import NS_PER_S
-from markers.target import Target
-from recording.reading.interpolation import interpolated
+from thermostand.compensation.history.known_states import Column, history_of
+from thermostand.compensation.history.thermal_history import History
+from thermostand.compensation.observations import Float, Observations, SessionFacts
+from thermostand.compensation.sound_values import LARGEST_SIDE_px, check_centres, check_degC
+from thermostand.experiments.steps import Role
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.markers.target import Target
+from thermostand.recording.reading.interpolation import interpolated
 
 _SPACING_mm = 1.0
 _ROUNDING = 1e-9

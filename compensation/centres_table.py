@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.arrays import observations_of
-from compensation.csv_rows import Row, numbers, read_rows
-from compensation.observations import Float, Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.arrays import observations_of
+from thermostand.compensation.csv_rows import Row, numbers, read_rows
+from thermostand.compensation.observations import Float, Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 NEEDED = ("frame", "marker", "x_px", "y_px", "camera_degC")
 OF_FRAMES = ("camera_degC", "time_ns", "chamber_degC", "role", "air_degC")

@@ -4,36 +4,46 @@ from __future__ import annotations
 
 import sys
 
-from foundation.usage import Lazy, lazy_app
+from thermostand.foundation.usage import Lazy, lazy_app
 
-_APPLY, _FIT = "compensation.commands.apply_cli", "compensation.commands.fit_cli"
-_FEW = "compensation.commands.few_frames_cli"
+_APPLY, _FIT = "thermostand.compensation.commands.apply_cli", "thermostand.compensation.commands.fit_cli"
+_FEW = "thermostand.compensation.commands.few_frames_cli"
 
 
 app = lazy_app(
     "Find markers, fit the thermal drift of a camera, report what compensation gains.\n\n"
     "Example: compensate report sessions/20260101T180000Z-thermal-cycle -o report.html",
     {
-        "detect": Lazy("compensation.commands.detect_cli", "Find the target's markers: a table of centres."),
+        "detect": Lazy(
+            "thermostand.compensation.commands.detect_cli", "Find the target's markers: a table of centres."
+        ),
         "fit": Lazy(_FIT, "Fit the drift model to the frames of sessions of one camera."),
         "report": Lazy(_FIT, "Write the report of sessions of one camera: drift, model, and what it gains."),
         "datasheet": Lazy(
-            "compensation.commands.datasheet_cli", "Write a camera's thermal datasheet, with uncertainties."
+            "thermostand.compensation.commands.datasheet_cli", "Write a camera's thermal datasheet, with uncertainties."
         ),
         "fit-like": Lazy(_FEW, "Fit a new unit of a camera type to few frames."),
         "anchor": Lazy(_FEW, "Fit a model to where the target is in a new session."),
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
         "export": Lazy(_APPLY, "Write the model for other programs: in Python with numpy only, in C, for ROS 2."),
-        "calibrate": Lazy("compensation.commands.calibration_cli", "Calibrate the camera: pinhole and ray model."),
+        "calibrate": Lazy(
+            "thermostand.compensation.commands.calibration_cli", "Calibrate the camera: pinhole and ray model."
+        ),
         "calibrate-photographs": Lazy(
-            "compensation.commands.photographs_cli", "Calibrate a camera from photographs of a board in any poses."
+            "thermostand.compensation.commands.photographs_cli",
+            "Calibrate a camera from photographs of a board in any poses.",
         ),
         "calibrate-rig": Lazy(
-            "compensation.commands.rig_cli", "Calibrate cameras that are fixed to each other, from photographs."
+            "thermostand.compensation.commands.rig_cli",
+            "Calibrate cameras that are fixed to each other, from photographs.",
         ),
-        "validate": Lazy("compensation.commands.validate_cli", "How far the target seems to move in space."),
-        "budget": Lazy("compensation.commands.budget_cli", "The stand's error budget, in um and px."),
-        "schema": Lazy("compensation.commands.schema_cli", "JSON Schemas of geometries and details, for editors."),
+        "validate": Lazy(
+            "thermostand.compensation.commands.validate_cli", "How far the target seems to move in space."
+        ),
+        "budget": Lazy("thermostand.compensation.commands.budget_cli", "The stand's error budget, in um and px."),
+        "schema": Lazy(
+            "thermostand.compensation.commands.schema_cli", "JSON Schemas of geometries and details, for editors."
+        ),
     },
     has_completion=True,
 )

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.errors import SessionError
+from thermostand.foundation.errors import SessionError
 
 Row = Mapping[str, str]
 

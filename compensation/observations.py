@@ -16,27 +16,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.finding.finder import Finder
-from compensation.finding.piece import FoundMarkers, joined, pieces_of
-from compensation.history.thermal_history import History, recorded_history
-from compensation.one_camera import others_ns, serial_of, take
-from compensation.one_equilibrium import check_sessions
-from experiments.steps import Role
-from foundation.documents import parse_document, yaml_data
-from foundation.errors import ConfigError, SessionError
-from foundation.progress import Report, unwatched
-from foundation.readings import TEMPERATURE_IN_DOUBT, UNSETTLED, Frame
-from markers.noise import Noise, estimate_noise
-from markers.target import Target
-from recording.format.utc_offsets import UtcOffsets
-from recording.reading.session import Session
-from recording.reading.using import Say, open_whole
+from thermostand.compensation.finding.finder import Finder
+from thermostand.compensation.finding.piece import FoundMarkers, joined, pieces_of
+from thermostand.compensation.history.thermal_history import History, recorded_history
+from thermostand.compensation.one_camera import others_ns, serial_of, take
+from thermostand.compensation.one_equilibrium import check_sessions
+from thermostand.experiments.steps import Role
+from thermostand.foundation.documents import parse_document, yaml_data
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.progress import Report, unwatched
+from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, UNSETTLED, Frame
+from thermostand.markers.noise import Noise, estimate_noise
+from thermostand.markers.target import Target
+from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.session import Session
+from thermostand.recording.reading.using import Say, open_whole
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 Progress = Callable[[str, float], AbstractContextManager[Report]]
-"""foundation.progress.progress, or anything like it: (title, total) -> a context that yields report(done, text)."""
+"""`progress` of foundation, or anything like it: (title, total) -> a context that yields report(done, text)."""
 
 _NOISE_FRAMES = 4
 _PREVIEW_WIDTH_PX = 816
@@ -193,8 +193,8 @@ def observe(
     camera: str | None = None,
 ) -> Observations:
     """All frames of all sessions, found once. camera: by its name, of those that have several; none the leading one.
-    target: instead of the ones attached to the sessions. progress: such as foundation.progress.progress. finder: how
-    the markers are found, else one frame after the other.
+    target: instead of the ones attached to the sessions. progress: such as foundation's. finder: how the
+    markers are found, else one frame after the other.
 
     SessionError when a session has frames of two equilibria of the camera, unless `across_gap`, or when something of it
     is missing, unless `incomplete` takes the sentence that says what.

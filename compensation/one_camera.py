@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from foundation.errors import SessionError
-from recording.reading.session import Session
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.session import Session
 
 
 def take(session: Session, name: str | None) -> None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from foundation.errors import SessionError
-from foundation.items import Event
-from recording.format.restarts import begins_of, is_superseded
-from recording.reading.session import Session
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Event
+from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.reading.session import Session
 
 CHANGED = "camera_offset_changed"
 _TRANSIENT_ROLES = frozenset({"warm_up", "settling", "other"})  # of a camera that is not in equilibrium anyway

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from compensation.drift_runtime import MOST_CORNERS, MOST_IMAGES, COLDEST_degC, HOTTEST_degC
+from thermostand.compensation.drift_runtime import MOST_CORNERS, MOST_IMAGES, COLDEST_degC, HOTTEST_degC
 
 LARGEST_SIDE_px = 100_000  # four times the largest sensors that are sold
 _FARTHEST_mm = 1e6

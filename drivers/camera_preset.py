@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from foundation.documents import Document
+from thermostand.foundation.documents import Document
 
 Effect = Literal["sag", "dead_zone", "creep", "stick_slip", "unrepeated", "coarse_sensor", "far_air"]
 

@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from foundation.documents import Document
-from foundation.errors import DeviceFault
-from foundation.events import DEVICE_IDENTITY
-from foundation.items import Event
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import DeviceFault
+from thermostand.foundation.events import DEVICE_IDENTITY
+from thermostand.foundation.items import Event
 
 DeviceName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]  # the first part of its channels
 PollPeriod_s = Annotated[float, Field(gt=0, le=3600)]

@@ -11,9 +11,17 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import Chamber_degC, Guaranteed, Linear_mm, MovingTable, Rotary_deg, TablePosition, Wait_s
-from experiments.pieces import frames_at, homes_checked, moved, soak
-from experiments.steps import CloseFlap, Role, StartChamber, Step, StopChamber
+from thermostand.experiments.parameters import (
+    Chamber_degC,
+    Guaranteed,
+    Linear_mm,
+    MovingTable,
+    Rotary_deg,
+    TablePosition,
+    Wait_s,
+)
+from thermostand.experiments.pieces import frames_at, homes_checked, moved, soak
+from thermostand.experiments.steps import CloseFlap, Role, StartChamber, Step, StopChamber
 
 
 class Calibration(MovingTable, Guaranteed):

@@ -13,8 +13,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from experiments.parameters import Known
-from experiments.steps import Capture, CloseFlap, Decide, OpenFlap, Role, SetTemperature, Soak, Step, usual_s
+from thermostand.experiments.parameters import Known
+from thermostand.experiments.steps import (
+    Capture,
+    CloseFlap,
+    Decide,
+    OpenFlap,
+    Role,
+    SetTemperature,
+    Soak,
+    Step,
+    usual_s,
+)
 
 MOST_VISITS = 200
 _VALIDATED_AFTER = 3

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from experiments.steps import Capture, PlannedStep, Role
+from thermostand.experiments.steps import Capture, PlannedStep, Role
 
 _DRIFT_ROLES = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 _SHOWS = ((14, 0.05), (8, 0.3))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from foundation.documents import Document
+from thermostand.foundation.documents import Document
 
 OnUnsettled = Literal["mark", "hold"]
 WantedState = Literal["at_rest", "on_the_way"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from experiments.parameters import CaptureParameters, Guaranteed, MovingTable, Settled, TablePosition
-from experiments.steps import (
+from thermostand.experiments.parameters import CaptureParameters, Guaranteed, MovingTable, Settled, TablePosition
+from thermostand.experiments.steps import (
     AnySoak,
     Capture,
     CheckHome,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from experiments.steps import Capture, Situation
-from experiments.written import PlanError, Written
+from thermostand.experiments.steps import Capture, Situation
+from thermostand.experiments.written import PlanError, Written
 
 MOST_STEPS = 100_000  # of a plan: weeks; it is still listed within seconds
 MOST_CAPTURES = 20_000  # more than any camera lives through

@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar, Protocol, Self, cast
 
 from pydantic import BeforeValidator, Field, StringConstraints, TypeAdapter, ValidationError, model_validator
 
-from experiments.parameters import (
+from thermostand.experiments.parameters import (
     SOAK_BAND_K,
     WANTED_STATES,
     CaptureParameters,
@@ -35,9 +35,9 @@ from experiments.parameters import (
     WARMEST_degC,
     check_until,
 )
-from foundation.document_faults import path_text
-from foundation.documents import Document
-from foundation.errors import ConfigError
+from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError
 
 GROUP = "thermostand.steps"
 LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)

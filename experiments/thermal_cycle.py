@@ -17,8 +17,8 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.known import MOST_VISITS, Frames, first_decision, fixed_visits
-from experiments.parameters import (
+from thermostand.experiments.known import MOST_VISITS, Frames, first_decision, fixed_visits
+from thermostand.experiments.parameters import (
     Chamber_degC,
     FrameCount,
     Guaranteed,
@@ -28,8 +28,8 @@ from experiments.parameters import (
     Wait_s,
     check_until,
 )
-from experiments.pieces import dwell, frames_through_flap, placed, soak
-from experiments.steps import SOAK_BAND_K, CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
+from thermostand.experiments.pieces import dwell, frames_through_flap, placed, soak
+from thermostand.experiments.steps import SOAK_BAND_K, CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
 
 
 class ThermalCycle(StillTable, Guaranteed):

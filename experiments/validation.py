@@ -13,7 +13,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from experiments.parameters import (
+from thermostand.experiments.parameters import (
     Chamber_degC,
     FrameCount,
     Guaranteed,
@@ -23,8 +23,8 @@ from experiments.parameters import (
     Wait_s,
     check_until,
 )
-from experiments.pieces import dwell, frames_at, homes_checked, moved, soak
-from experiments.steps import CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
+from thermostand.experiments.pieces import dwell, frames_at, homes_checked, moved, soak
+from thermostand.experiments.steps import CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
 
 
 class Validation(MovingTable, Guaranteed):

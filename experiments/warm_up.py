@@ -14,9 +14,9 @@ from typing import Annotated, Self
 
 from pydantic import Field, StringConstraints, model_validator
 
-from experiments.parameters import Chamber_degC, FrameCount, StillTable, Wait_s
-from experiments.pieces import placed
-from experiments.steps import (
+from thermostand.experiments.parameters import Chamber_degC, FrameCount, StillTable, Wait_s
+from thermostand.experiments.pieces import placed
+from thermostand.experiments.steps import (
     Capture,
     CloseFlap,
     CoolDown,

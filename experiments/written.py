@@ -26,10 +26,10 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from experiments.parameters import Chamber_degC
-from experiments.steps import STEPS, SetTemperature, Situation, Soak, Step, kind_of_step
-from foundation.documents import Document
-from foundation.errors import ConfigError
+from thermostand.experiments.parameters import Chamber_degC
+from thermostand.experiments.steps import STEPS, SetTemperature, Situation, Soak, Step, kind_of_step
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError
 
 Place = tuple[str | int, ...]  # of an entry within the recipe, as in ("experiments", 0, "steps", 3)
 

@@ -22,7 +22,7 @@ from queue import SimpleQueue
 from threading import Event, Lock
 from typing import Any, TypeVar
 
-from foundation.clock import Clock, VirtualClock
+from thermostand.foundation.clock import Clock, VirtualClock
 
 Result = TypeVar("Result")
 

@@ -10,9 +10,9 @@ from typing import Annotated, Any, TypeVar, cast, get_type_hints
 
 import typer
 
-from foundation.exit_codes import one_line_errors
-from foundation.output import Output, outputting
-from foundation.usage import OneLineUsage, VersionOption
+from thermostand.foundation.exit_codes import one_line_errors
+from thermostand.foundation.output import Output, outputting
+from thermostand.foundation.usage import OneLineUsage, VersionOption
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

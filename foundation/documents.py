@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from foundation.document_faults import path_text, sentences, words_for_numbers, yaml_fault
-from foundation.errors import ConfigError, NotThere, SessionError
-from foundation.files import unreadable
+from thermostand.foundation.document_faults import path_text, sentences, words_for_numbers, yaml_fault
+from thermostand.foundation.errors import ConfigError, NotThere, SessionError
+from thermostand.foundation.files import unreadable
 
 if TYPE_CHECKING or not yaml.__with_libyaml__:
     from yaml import SafeLoader as QuickLoader

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from string import Formatter
 from typing import Literal, NamedTuple
 
-from foundation.instants import utc_text
-from foundation.items import Event
+from thermostand.foundation.instants import utc_text
+from thermostand.foundation.items import Event
 
 Data = Mapping[str, object]
 Level = Literal["info", "warning", "error"]

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 import typer
 
-from foundation.errors import ConfigError, Interrupted, NotCleared, NotThere, StandError
-from foundation.output import output
-from foundation.usage import ended, failed
+from thermostand.foundation.errors import ConfigError, Interrupted, NotCleared, NotThere, StandError
+from thermostand.foundation.output import output
+from thermostand.foundation.usage import ended, failed
 
 FAILED = 1
 BAD_INPUT = 2

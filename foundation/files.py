@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
-from foundation.errors import SessionError
+from thermostand.foundation.errors import SessionError
 
 
 def unreadable(path: Path | str, error: OSError | UnicodeDecodeError) -> str:

@@ -19,8 +19,8 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
-from foundation.calls import Line, answer_all
-from foundation.patience import Patience
+from thermostand.foundation.calls import Line, answer_all
+from thermostand.foundation.patience import Patience
 
 _END_WITHIN_S = 0.5
 _LOOK_S = 0.01
@@ -36,7 +36,7 @@ class Helper:
     def __init__(self, module: str, lines: Sequence[str], ended: str) -> None:
         pairs = [socket.socketpair() for _ in ("life", *lines)]
         numbers = [theirs.fileno() for _, theirs in pairs]
-        command = [sys.executable, "-m", "foundation.helper", module, str(os.getpid()), *map(str, numbers)]
+        command = [sys.executable, "-m", "thermostand.foundation.helper", module, str(os.getpid()), *map(str, numbers)]
         try:
             self._process = subprocess.Popen(
                 command,
@@ -114,8 +114,9 @@ def _how(status: int) -> str:
 
 
 def main() -> None:
-    """`python -m foundation.helper MODULE DAEMON FD ...`: serve the daemon at these sockets until it is gone; the first
-    carries nothing, its end is the daemon's. MODULE is imported first: from then on it is in memory."""
+    """`python -m thermostand.foundation.helper MODULE DAEMON FD ...`: serve the daemon at these sockets until it
+    is gone; the first carries nothing, its end is the daemon's. MODULE is imported first: from then on it is in
+    memory."""
     module = importlib.import_module(sys.argv[1])
     getattr(module, "prepare", _nothing)()
     kept: dict[str, object] = {}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from foundation.items import Batch, Event, Item
-from foundation.readings import Quality, Reading
-from foundation.repeats import RepeatLimit
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.foundation.repeats import RepeatLimit
 
 Subscriber = Callable[[Item], None]
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from foundation.readings import Frame, Reading
+from thermostand.foundation.readings import Frame, Reading
 
 
 class StepState(StrEnum):

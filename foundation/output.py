@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import typer
 
-from foundation.json_values import plain
-from foundation.usage import answer, one_line
+from thermostand.foundation.json_values import plain
+from thermostand.foundation.usage import answer, one_line
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.output import output
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.output import output
 
 # Plain output: a line each time this share of the work is done, so that a log stays readable.
 _PLAIN_STEP = 0.1

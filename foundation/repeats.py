@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
-from foundation.clock import NS_PER_S
-from foundation.events import always_published
-from foundation.items import Event
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import always_published
+from thermostand.foundation.items import Event
 
 FIRST, PERIOD_NS = 3, 1200 * NS_PER_S
 """The first three at once, then one each 20 minutes that counts those between: at most six in any hour."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from foundation.files import write_whole
+from thermostand.foundation.files import write_whole
 
 
 def schema_text(model: type[BaseModel]) -> str:

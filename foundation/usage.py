@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
-from foundation.version import installed_version
+from thermostand.foundation.version import installed_version
 
 _BAD_INPUT, _INTERRUPTED = 2, 130  # of exit_codes, which imports this module
 

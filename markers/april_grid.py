@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from foundation.documents import Document
+from thermostand.foundation.documents import Document
 
 Positive = Annotated[float, Field(gt=0)]
 Float = NDArray[np.float64]

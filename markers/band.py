@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.edge_fit import EdgeFit
-from markers.edge_model import Float
-from markers.sandwich import variance_growth, variance_ratio
+from thermostand.markers.edge_fit import EdgeFit
+from thermostand.markers.edge_model import Float
+from thermostand.markers.sandwich import variance_growth, variance_ratio
 
 WIDE_SIGMA, NARROW_SIGMA = 9.0, 4.5
 """Half widths of the band in blurs."""

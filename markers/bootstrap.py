@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from markers.noise import Image, full_scale_DN
-from markers.target import Target
+from thermostand.markers.noise import Image, full_scale_DN
+from thermostand.markers.target import Target
 
 _CELLS_PER_DISC = 9.5
 """The surroundings are looked at on a coarse grid with about this many cells across the largest disc."""

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numba.core.event import Listener, install_listener
 
-from markers.edge_fit import fit_edges
-from markers.edge_model import PARAMETERS, EdgeState
-from markers.noise import Noise
-from markers.pixels import picture_of
-from markers.refit import refit_edges
+from thermostand.markers.edge_fit import fit_edges
+from thermostand.markers.edge_model import PARAMETERS, EdgeState
+from thermostand.markers.noise import Noise
+from thermostand.markers.pixels import picture_of
+from thermostand.markers.refit import refit_edges
 
 
 def compile_ahead(tell: Callable[[], None]) -> None:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from foundation.documents import Document, load_document, read_document
-from foundation.errors import DetectionError
-from markers.april_grid import AprilGrid, find_tag_corners
-from markers.noise import Image, full_scale_DN
+from thermostand.foundation.documents import Document, load_document, read_document
+from thermostand.foundation.errors import DetectionError
+from thermostand.markers.april_grid import AprilGrid, find_tag_corners
+from thermostand.markers.noise import Image, full_scale_DN
 
 SIGMA_px = 0.03
 

@@ -22,19 +22,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.band import NARROW_SIGMA, WIDE_EXCESS, WIDE_SIGMA, Strangeness, excess_px2, strangeness
-from markers.bootstrap import Candidates, disc_sizes_px, find_candidates
-from markers.edge_fit import EdgeFit, Flag, fit_edges
-from markers.edge_model import B0, F0, SIGMA, EdgeState
-from markers.expected import expected_edges, implied_edges
-from markers.following import has_followed, rows_round, still_there
-from markers.grid import DetectionError, Identified, expected_px, fit_homography, identify, pitch_px, project
-from markers.light import under_common_light
-from markers.noise import Image, Noise
-from markers.pixels import Mask, Picture, picture_of
-from markers.refit import refit_edges
-from markers.sandwich import SAMPLED_MARKERS
-from markers.target import Target
+from thermostand.markers.band import NARROW_SIGMA, WIDE_EXCESS, WIDE_SIGMA, Strangeness, excess_px2, strangeness
+from thermostand.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
+from thermostand.markers.edge_fit import EdgeFit, Flag, fit_edges
+from thermostand.markers.edge_model import B0, F0, SIGMA, EdgeState
+from thermostand.markers.expected import expected_edges, implied_edges
+from thermostand.markers.following import has_followed, rows_round, still_there
+from thermostand.markers.grid import (
+    DetectionError,
+    Identified,
+    expected_px,
+    fit_homography,
+    identify,
+    pitch_px,
+    project,
+)
+from thermostand.markers.light import under_common_light
+from thermostand.markers.noise import Image, Noise
+from thermostand.markers.pixels import Mask, Picture, picture_of
+from thermostand.markers.refit import refit_edges
+from thermostand.markers.sandwich import SAMPLED_MARKERS
+from thermostand.markers.target import Target
 
 __all__ = [
     "Detection",

@@ -12,10 +12,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from foundation.files import whole_file
-from markers.detection import Detection, Flag
-from markers.eccentricity import Float, disc_centres
-from markers.target import Target
+from thermostand.foundation.files import whole_file
+from thermostand.markers.detection import Detection, Flag
+from thermostand.markers.eccentricity import Float, disc_centres
+from thermostand.markers.target import Target
 
 COLUMNS = (
     "image", "time_ns", "marker", "row", "column", "x_px", "y_px", "var_x_px2", "cov_xy_px2", "var_y_px2", "flags",

@@ -13,10 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.detection import Detection
-from markers.grid import fit_homography, project
-from markers.plane import to_image
-from markers.target import Target
+from thermostand.markers.detection import Detection
+from thermostand.markers.grid import fit_homography, project
+from thermostand.markers.plane import to_image
+from thermostand.markers.target import Target
 
 _ROUNDS = 3
 _OUTLINE_POINTS = 96

@@ -13,10 +13,10 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import NDArray
 
-from markers import edge_model, newton, pixels, sandwich, sectors
-from markers.compiled import digest, entry
-from markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, Variance
-from markers.newton import (
+from thermostand.markers import edge_model, newton, pixels, sandwich, sectors
+from thermostand.markers.compiled import digest, entry
+from thermostand.markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, Variance
+from thermostand.markers.newton import (
     DIVERGED,
     LEAST_BAND_PX,
     SETTLED,
@@ -27,10 +27,10 @@ from markers.newton import (
     no_belief,
     settle,
 )
-from markers.noise import Noise
-from markers.pixels import Picture, Pixels, empty_pixels
-from markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
-from markers.sectors import misfits
+from thermostand.markers.noise import Noise
+from thermostand.markers.pixels import Picture, Pixels, empty_pixels
+from thermostand.markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
+from thermostand.markers.sectors import misfits
 
 _SATURATED_PART = 0.1
 

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.compiled import compiled
-from markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, VALUE, Pixels, Single, U, V
+from thermostand.markers.compiled import compiled
+from thermostand.markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, VALUE, Pixels, Single, U, V
 
 CX, CY, M11, M12, M22, SIGMA, B0, BX, BY, F0, FX, FY = range(12)
 PARAMETERS = 12

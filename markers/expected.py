@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.edge_model import B0, CX, CY, M11, M12, M22, SIGMA, EdgeState, Float
-from markers.plane import expected_px, project
-from markers.target import Target
+from thermostand.markers.edge_model import B0, CX, CY, M11, M12, M22, SIGMA, EdgeState, Float
+from thermostand.markers.plane import expected_px, project
+from thermostand.markers.target import Target
 
 _FIRST_BLUR_PX = 1.2
 _LEAST_PEERS = 8

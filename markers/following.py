@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from markers.edge_model import CX, CY, M11, M12, M22, SIGMA, EdgeState, Float
-from markers.newton import LEAST_BAND_PX
-from markers.pixels import Mask, Picture
+from thermostand.markers.edge_model import CX, CY, M11, M12, M22, SIGMA, EdgeState, Float
+from thermostand.markers.newton import LEAST_BAND_PX
+from thermostand.markers.pixels import Mask, Picture
 
 _FOLLOWED_PART = 0.9
 _GREATEST_STEP_PX = 5.0

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from foundation.errors import DetectionError
-from markers.bootstrap import Candidates
-from markers.lattice import largest_lattice
-from markers.marks import with_marks
-from markers.placement import LEAST_SEEN, Placement, placements, settled
-from markers.plane import area_scale, expected_px, fit_homography, pitch_px, project, roll_deg
-from markers.target import Target
+from thermostand.foundation.errors import DetectionError
+from thermostand.markers.bootstrap import Candidates
+from thermostand.markers.lattice import largest_lattice
+from thermostand.markers.marks import with_marks
+from thermostand.markers.placement import LEAST_SEEN, Placement, placements, settled
+from thermostand.markers.plane import area_scale, expected_px, fit_homography, pitch_px, project, roll_deg
+from thermostand.markers.target import Target
 
 __all__ = [
     "DetectionError",

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import PIL.Image
 
-from foundation.image_limit import size_fault
-from markers.detection import DetectionError, Image, grey_image
+from thermostand.foundation.image_limit import size_fault
+from thermostand.markers.detection import DetectionError, Image, grey_image
 
 _ORIENTATION, _UPRIGHT = 0x0112, 1
 """EXIF tag (CIPA DC-008, table 4) and its value for pixels that are stored as they are to be shown."""

@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.edge_fit import EdgeFit
-from markers.edge_model import B0, F0, PARAMETERS, EdgeState, Float
+from thermostand.markers.edge_fit import EdgeFit
+from thermostand.markers.edge_model import B0, F0, PARAMETERS, EdgeState, Float
 
 _LEAST_MARKERS = 20
 """So many determine w^2 to a quarter of the variance of r."""

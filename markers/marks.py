@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.errors import DetectionError
-from markers.bootstrap import Candidates
-from markers.placement import Placement
-from markers.plane import area_scale
-from markers.target import DonutMarkers, OddMarker, Target
+from thermostand.foundation.errors import DetectionError
+from thermostand.markers.bootstrap import Candidates
+from thermostand.markers.placement import Placement
+from thermostand.markers.plane import area_scale
+from thermostand.markers.target import DonutMarkers, OddMarker, Target
 
 _MOST_WRONG = 1
 """Of the markers of a placement, those with a hole that should have none or without one that should: glare in a disc

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from markers.compiled import compiled
-from markers.edge_model import (
+from thermostand.markers.compiled import compiled
+from thermostand.markers.edge_model import (
     B0,
     BX,
     BY,
@@ -26,8 +26,8 @@ from markers.edge_model import (
     Variance,
     normal_equations,
 )
-from markers.pixels import SHARE, VALUE, Gathered, Limits, Picture, Pixels, U, V, gather
-from markers.sectors import SECTORS, Bools, all_kept, number_of, set_aside
+from thermostand.markers.pixels import SHARE, VALUE, Gathered, Limits, Picture, Pixels, U, V, gather
+from thermostand.markers.sectors import SECTORS, Bools, all_kept, number_of, set_aside
 
 LEAST_BAND_PX = 3.5
 CORE_SIGMA = 5.0

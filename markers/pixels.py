@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.compiled import compiled
-from markers.noise import Image, full_scale_DN
+from thermostand.markers.compiled import compiled
+from thermostand.markers.noise import Image, full_scale_DN
 
 Float = NDArray[np.float64]
 Columns = NDArray[np.int64]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from foundation.errors import DetectionError
-from markers.lattice import Cell
-from markers.plane import area_scale, checked_homography, expected_px, fit_homography, pitch_px, project
-from markers.target import Target
+from thermostand.foundation.errors import DetectionError
+from thermostand.markers.lattice import Cell
+from thermostand.markers.plane import area_scale, checked_homography, expected_px, fit_homography, pitch_px, project
+from thermostand.markers.target import Target
 
 _MISSING_PX = 0.5
 _FEWER_THAN_BEST = 2

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.errors import DetectionError
-from markers.target import Target
+from thermostand.foundation.errors import DetectionError
+from thermostand.markers.target import Target
 
 _LEAST_FOR_DEGREE = {5: 80, 3: 20}
 """A polynomial of this degree needs so many markers: about four for each coefficient, or two for the cubic."""

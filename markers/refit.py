@@ -14,14 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from markers import edge_model, newton, pixels, sectors
-from markers.compiled import compiled, digest, entry
-from markers.edge_fit import room
-from markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
-from markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
-from markers.noise import Noise
-from markers.pixels import Picture, Pixels, empty_pixels
-from markers.sectors import SECTORS, Bools, all_kept, number_of, sector_misfits
+from thermostand.markers import edge_model, newton, pixels, sectors
+from thermostand.markers.compiled import compiled, digest, entry
+from thermostand.markers.edge_fit import room
+from thermostand.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
+from thermostand.markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
+from thermostand.markers.noise import Noise
+from thermostand.markers.pixels import Picture, Pixels, empty_pixels
+from thermostand.markers.sectors import SECTORS, Bools, all_kept, number_of, sector_misfits
 
 _LEAST_SECTORS = 13
 """35 %: with fewer the centre hangs on the shape that the other markers have."""

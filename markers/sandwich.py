@@ -20,8 +20,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.compiled import compiled
-from markers.edge_model import (
+from thermostand.markers.compiled import compiled
+from thermostand.markers.edge_model import (
     B0,
     BLOCK,
     CX,
@@ -40,7 +40,7 @@ from markers.edge_model import (
     derivatives,
     load_block,
 )
-from markers.pixels import CORE, DISC, GROUND, Pixels
+from thermostand.markers.pixels import CORE, DISC, GROUND, Pixels
 
 MOST_CLUSTERS = 6
 _LEAST_CLUSTERS = 2

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.compiled import compiled
-from markers.edge_model import CX, CY, Float
-from markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, Pixels, U, V
+from thermostand.markers.compiled import compiled
+from thermostand.markers.edge_model import CX, CY, Float
+from thermostand.markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, Pixels, U, V
 
 Bools = NDArray[np.bool_]
 Sectors = NDArray[np.int32]

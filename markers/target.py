@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from foundation.documents import Document, load_document
+from thermostand.foundation.documents import Document, load_document
 
 _CMM_TOLERANCE = 0.25
 """A measured centre further than this part of the pitch from its nominal place means a wrong order or a wrong unit."""

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.bootstrap import Candidates, disc_sizes_px, find_candidates
-from markers.grid import DetectionError, Identified, identify, project
-from markers.noise import Image
-from markers.target import Target
+from thermostand.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
+from thermostand.markers.grid import DetectionError, Identified, identify, project
+from thermostand.markers.noise import Image
+from thermostand.markers.target import Target
 
 MARGIN_px = 20
 """Around each marker's outline. The edge fit reads 9 blurs, 18 px for a lens that blurs by sigma = 2 px; the rest is

@@ -9,42 +9,42 @@ from typing import Protocol, cast
 
 import usb.backend
 
-from drivers.devices.absent_devices import NoFlap, NoRelays
-from drivers.devices.cameras.cameras_by_protocol import make_camera
-from drivers.devices.chambers.climate_chamber import ClimateChamber
-from drivers.devices.imager.thermal_imager import ThermalImager
-from drivers.devices.inputs import Inputs
-from drivers.devices.motion.flap import Flap, FlapSettings
-from drivers.devices.motion.stage import Axis
-from drivers.devices.probes import Probe
-from drivers.devices.protocols import Controller, Sensor, Shutter, Switches
-from drivers.devices.regulators.heat_module import HeatModule
-from drivers.devices.regulators.heat_pulses import HeatPulses
-from drivers.devices.regulators.regulator import Regulator
-from drivers.devices.regulators.software_regulator import SoftwareRegulator, SoftwareRegulatorSettings
-from drivers.devices.relays import Relays, RelaysSettings
-from drivers.devices.thermometers import SeveralModules, Thermometers
-from drivers.settings import EquilibriumSettings, OnBus
-from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit
-from drivers.wires.registers import RegisterMap, load_register_map
-from foundation.clock import Clock, VirtualClock
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from stand.chamber.chamber import ChamberLimits
-from stand.chamber.permits import PermitLimits
-from stand.config.stand_config import StandConfig, packaged
-from stand.estimating.camera_lines import sharing
-from stand.fault import Fault
-from stand.guarding.channels import ChannelCheck
-from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Recording, Watch, heat_uncontrolled, intrusion
-from stand.guarding.met_errors import MetErrors
-from stand.guarding.notify import Notifier
-from stand.guarding.rules import Announcements, camera_measured, natures, recorded, vital, watches
-from stand.imaging.camera_supply import SupplyLimits
-from stand.poller import Poller
-from stand.stand import Devices, Stand
+from thermostand.drivers.devices.absent_devices import NoFlap, NoRelays
+from thermostand.drivers.devices.cameras.cameras_by_protocol import make_camera
+from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamber
+from thermostand.drivers.devices.imager.thermal_imager import ThermalImager
+from thermostand.drivers.devices.inputs import Inputs
+from thermostand.drivers.devices.motion.flap import Flap, FlapSettings
+from thermostand.drivers.devices.motion.stage import Axis
+from thermostand.drivers.devices.probes import Probe
+from thermostand.drivers.devices.protocols import Controller, Sensor, Shutter, Switches
+from thermostand.drivers.devices.regulators.heat_module import HeatModule
+from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses
+from thermostand.drivers.devices.regulators.regulator import Regulator
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator, SoftwareRegulatorSettings
+from thermostand.drivers.devices.relays import Relays, RelaysSettings
+from thermostand.drivers.devices.thermometers import SeveralModules, Thermometers
+from thermostand.drivers.settings import EquilibriumSettings, OnBus
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.modbus_unit import ModbusUnit
+from thermostand.drivers.wires.registers import RegisterMap, load_register_map
+from thermostand.foundation.clock import Clock, VirtualClock
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.stand.chamber.chamber import ChamberLimits
+from thermostand.stand.chamber.permits import PermitLimits
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.estimating.camera_lines import sharing
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.channels import ChannelCheck
+from thermostand.stand.guarding.guard import Guard
+from thermostand.stand.guarding.interlocks import Recording, Watch, heat_uncontrolled, intrusion
+from thermostand.stand.guarding.met_errors import MetErrors
+from thermostand.stand.guarding.notify import Notifier
+from thermostand.stand.guarding.rules import Announcements, camera_measured, natures, recorded, vital, watches
+from thermostand.stand.imaging.camera_supply import SupplyLimits
+from thermostand.stand.poller import Poller
+from thermostand.stand.stand import Devices, Stand
 
 _NO_BOARD_POLL_S = 5.0
 

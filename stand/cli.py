@@ -13,7 +13,7 @@ def app() -> None:
     """Run the command line; ends the process."""
     atexit.register(gc.freeze)  # else all that was imported is searched for garbage first: 0.25 s of processor time
     try:
-        from stand.commands.command_table import app as commands
+        from thermostand.stand.commands.command_table import app as commands
     except KeyboardInterrupt:
         sys.stderr.write("interrupted; nothing was started\n")
         sys.exit(_INTERRUPTED)

@@ -8,9 +8,9 @@ from typing import Literal, Protocol
 
 from pydantic import JsonValue
 
-from foundation.events import guard_kind
-from foundation.items import Event
-from foundation.readings import Reading
+from thermostand.foundation.events import guard_kind
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Reading
 
 
 class Readings(Protocol):

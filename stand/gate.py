@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 from enum import StrEnum
 
-from foundation.events import CAMERA_ENDS, CLEAR, DISK, ROOM, Alert, event
+from thermostand.foundation.events import CAMERA_ENDS, CLEAR, DISK, ROOM, Alert, event
 
 Listener = Callable[[str, bool], None]
 

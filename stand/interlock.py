@@ -6,9 +6,9 @@ from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from typing import Protocol
 
-from foundation.errors import StandTripped
-from stand.fault import Fault
-from stand.gate import INTERLOCK, STOPPING, Gate
+from thermostand.foundation.errors import StandTripped
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import INTERLOCK, STOPPING, Gate
 
 
 class Interlocked(StandTripped):

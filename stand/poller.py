@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.devices.protocols import Sensor
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.errors import DeviceError
-from foundation.events import DEVICE_BACK, DEVICE_FAST, DEVICE_LOST, DEVICE_SLOW
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Cause, Reading, bad_reading
+from thermostand.drivers.devices.protocols import Sensor
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError
+from thermostand.foundation.events import DEVICE_BACK, DEVICE_FAST, DEVICE_LOST, DEVICE_SLOW
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Cause, Reading, bad_reading
 
 _AGAIN_S = 1.0  # after a poll that failed on the wire
 _FAST_AFTER_NS = 600 * NS_PER_S

@@ -11,11 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import GarbledReply, Unreachable
-from foundation.events import CONFIRMED_SAFE, NOT_CONFIRMED_SAFE
-from foundation.hub import Hub
-from foundation.tasks import first_of
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import GarbledReply, Unreachable
+from thermostand.foundation.events import CONFIRMED_SAFE, NOT_CONFIRMED_SAFE
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.tasks import first_of
 
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
 _PAUSE_S = 1.0  # between tries

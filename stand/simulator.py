@@ -12,13 +12,13 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from drivers.camera_preset import CameraPreset
-from foundation.addresses import tcp_place
-from foundation.clock import seconds_ns
-from foundation.documents import load_document
-from foundation.errors import ConfigError, Refused, Unreachable
-from stand.config.simulation import SimulatedCamera
-from stand.config.stand_config import StandConfig, packaged
+from thermostand.drivers.camera_preset import CameraPreset
+from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.documents import load_document
+from thermostand.foundation.errors import ConfigError, Refused, Unreachable
+from thermostand.stand.config.simulation import SimulatedCamera
+from thermostand.stand.config.stand_config import StandConfig, packaged
 
 _STOP_LIMIT_S = 5.0
 _CONNECT_S = 5.0
@@ -176,7 +176,7 @@ def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
 def list_faults() -> list[dict[str, object]]:
     """The simulator's table of faults: name, worst, mended, text."""
     found = subprocess.run(
-        [sys.executable, "-m", "drivers.sim", "--faults"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "thermostand.drivers.sim", "--faults"], capture_output=True, text=True, check=True
     )
     rows: list[dict[str, object]] = json.loads(found.stdout)
     return rows
@@ -186,7 +186,7 @@ class Simulator:
     """A running simulator process; `addresses` says where each device and the control socket answers. module: what
     simulates; tests have one that also writes down what truly happens."""
 
-    module = "drivers.sim"
+    module = "thermostand.drivers.sim"
 
     def __init__(self, laboratory: Mapping[str, object]) -> None:
         self._process = subprocess.Popen(

@@ -5,24 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from drivers.devices.imager.thermal_imager import ThermalImager
-from drivers.devices.inputs import Inputs
-from drivers.devices.motion.stage import Axis
-from drivers.devices.probes import Probe
-from drivers.devices.protocols import Actuator, Camera, Controller, Shutter, Switches
-from drivers.devices.regulators.heat_module import HeatModule
-from drivers.devices.thermometers import SeveralModules, Thermometers
-from foundation.clock import Clock
-from foundation.events import PROMPT, PROMPT_SKIPPED
-from foundation.hub import Hub
-from stand.chamber.chamber import Chamber, ChamberLimits
-from stand.gate import OPERATOR, Gate
-from stand.imaging.camera_supply import CameraSupply, SupplyLimits
-from stand.imaging.cameras import Cameras
-from stand.imaging.imaging import Imaging
-from stand.interlock import Interlock, Motions
-from stand.safety import Safety
-from stand.table.stages import Table
+from thermostand.drivers.devices.imager.thermal_imager import ThermalImager
+from thermostand.drivers.devices.inputs import Inputs
+from thermostand.drivers.devices.motion.stage import Axis
+from thermostand.drivers.devices.probes import Probe
+from thermostand.drivers.devices.protocols import Actuator, Camera, Controller, Shutter, Switches
+from thermostand.drivers.devices.regulators.heat_module import HeatModule
+from thermostand.drivers.devices.thermometers import SeveralModules, Thermometers
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.events import PROMPT, PROMPT_SKIPPED
+from thermostand.foundation.hub import Hub
+from thermostand.stand.chamber.chamber import Chamber, ChamberLimits
+from thermostand.stand.gate import OPERATOR, Gate
+from thermostand.stand.imaging.camera_supply import CameraSupply, SupplyLimits
+from thermostand.stand.imaging.cameras import Cameras
+from thermostand.stand.imaging.imaging import Imaging
+from thermostand.stand.interlock import Interlock, Motions
+from thermostand.stand.safety import Safety
+from thermostand.stand.table.stages import Table
 
 _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor must not be worn
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from foundation.errors import SessionError
-from stand.serving.client import LIMIT_S, Answer, server_of
-from stand.serving.desk import RunStatus
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.serving.client import LIMIT_S, Answer, server_of
+from thermostand.stand.serving.desk import RunStatus
 
 
 def ask(session: Path, verb: str, body: Mapping[str, object] | None = None, timeout_s: float = LIMIT_S) -> Answer:

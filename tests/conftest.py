@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, settings
 # Before NumPy is loaded: as the commands and `make test` have it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from recording.writing import notices
 from tests import forked
 from tests.forked import STARTERS, Forks, Programs
 from tests.stock_camera import run_stock_camera
 from tests.workers import run_units
+from thermostand.recording.writing import notices
 
 # How long an example takes says how busy the machine is.
 settings.register_profile("day", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -25,21 +25,44 @@ from pathlib import Path
 from select import select
 from typing import Any, NoReturn
 
-_ENTRIES = {"drivers.sim": "drivers.sim.__main__:main", "stand.cli": "stand.cli:app"}
+_ENTRIES = {
+    "thermostand.drivers.sim": "thermostand.drivers.sim.__main__:main",
+    "thermostand.stand.cli": "thermostand.stand.cli:app",
+}
 """Of what `python -m` starts, what runs it; of other modules it is `main`."""
-_INTERFACE = ("stand.serving.api.app", "stand.serving.api.listening", "stand.serving.api.stream")
+_INTERFACE = (
+    "thermostand.stand.serving.api.app",
+    "thermostand.stand.serving.api.listening",
+    "thermostand.stand.serving.api.stream",
+)
 """Modules that a daemon imports when it begins to answer."""
 _LOADED = {
-    "stand.cli": ("stand.commands.run_cli", "stand.commands.serve_cli", "stand.commands.queue_cli", *_INTERFACE),
-    "tests.torture.product": ("stand.commands.run_cli", *_INTERFACE),
-    "tests.code": ("stand.running.run", "stand.queueing.queue_work", "stand.serving.api.server", *_INTERFACE),
-    "recording.writing.disk": ("recording.writing.recorder", "stand.queueing.queue_work"),
-    "stand.serving.preview_process": ("stand.serving.preview", "stand.serving.recorded_drift"),
+    "thermostand.stand.cli": (
+        "thermostand.stand.commands.run_cli",
+        "thermostand.stand.commands.serve_cli",
+        "thermostand.stand.commands.queue_cli",
+        *_INTERFACE,
+    ),
+    "tests.torture.product": ("thermostand.stand.commands.run_cli", *_INTERFACE),
+    "tests.code": (
+        "thermostand.stand.running.run",
+        "thermostand.stand.queueing.queue_work",
+        "thermostand.stand.serving.api.server",
+        *_INTERFACE,
+    ),
+    "thermostand.recording.writing.disk": (
+        "thermostand.recording.writing.recorder",
+        "thermostand.stand.queueing.queue_work",
+    ),
+    "thermostand.stand.serving.preview_process": (
+        "thermostand.stand.serving.preview",
+        "thermostand.stand.serving.recorded_drift",
+    ),
 }
 """What such a program imports on its way, too."""
-_HELPER = "foundation.helper"
+_HELPER = "thermostand.foundation.helper"
 """It is given the module whose calls it makes."""
-STARTERS = ("stand.simulator", "foundation.helper")
+STARTERS = ("thermostand.stand.simulator", "thermostand.foundation.helper")
 """Modules that start such programs themselves."""
 _AT_THE_START = ("PYTHONPATH", "LD_PRELOAD", "NUMBA_CACHE_DIR", "PYTHONWARNINGS")
 """Who changes one of these gets a program of its own: they count while modules are loaded."""

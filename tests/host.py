@@ -1,6 +1,6 @@
 """A host whose clocks a test moves."""
 
-from foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.clock import WallClock, seconds_ns
 
 
 class Host:

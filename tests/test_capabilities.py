@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from experiments.written import StepEntry
-from stand.config.recipe import Experiment
-from stand.config.stand_config import StandConfig
 from tests.golden.product import commands
+from thermostand.experiments.written import StepEntry
+from thermostand.stand.config.recipe import Experiment
+from thermostand.stand.config.stand_config import StandConfig
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "tests" / "capabilities.md").read_text("utf-8")

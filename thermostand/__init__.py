@@ -8,7 +8,7 @@
 `thermostand.__version__` is the installed version, which pyproject.toml states.
 """
 
-from foundation.lazy_names import lazy_names
+from thermostand.foundation.lazy_names import lazy_names
 
 _public, __dir__, __all__ = lazy_names(__name__, __file__)
 

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from compensation import drift_runtime
-from compensation.apply.runtime_export import runtime_model
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.terms import Kind, power_of
-from foundation.errors import ConfigError
-from foundation.files import write_whole
+from thermostand.compensation import drift_runtime
+from thermostand.compensation.apply.runtime_export import runtime_model
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.terms import Kind, power_of
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.files import write_whole
 
 Float = NDArray[np.float64]
 
@@ -56,7 +56,9 @@ def export_c(model: DriftModel, path: Path) -> Path:
 def header_text(model: Mapping[str, Any], prefix: str = "drift") -> str:
     """The header of a runtime model, as drift.json holds it."""
     constants = "\n".join(_constants(model))
-    functions = importlib.resources.files("compensation.apply").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    functions = (
+        importlib.resources.files("thermostand.compensation.apply").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    )
     guard = "DRIFT_HEADER_H"
     text = f"{_about(model)}#ifndef {guard}\n#define {guard}\n\n{_INCLUDES}\n{constants}\n\n{functions}\n#endif\n"
     return re.sub(r"\bDRIFT_", f"{prefix.upper()}_", re.sub(r"\bdrift_", f"{prefix}_", text))

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.apply.resample import BLOCK_px, Image, resample
-from compensation.drift.drift_model import DriftModel
-from compensation.drift_runtime import source_offset
-from compensation.history.states import Float, States
-from foundation.errors import SessionError
-from foundation.files import write_whole_bytes
+from thermostand.compensation.apply.resample import BLOCK_px, Image, resample
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift_runtime import source_offset
+from thermostand.compensation.history.states import Float, States
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import write_whole_bytes
 
 Form = Literal["tiff", "png"]
 Shift = Callable[[Float], Float]

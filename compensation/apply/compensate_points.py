@@ -6,11 +6,11 @@ import csv
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from compensation.csv_rows import Row, read_rows
-from compensation.drift.drift_model import DriftModel, Outside
-from compensation.history.states import Float, States
-from foundation.errors import ConfigError, SessionError
-from foundation.files import whole_file
+from thermostand.compensation.csv_rows import Row, read_rows
+from thermostand.compensation.drift.drift_model import DriftModel, Outside
+from thermostand.compensation.history.states import Float, States
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.files import whole_file
 
 X, Y, TIME, CAMERA = "x_px", "y_px", "time_ns", "camera_degC"
 ADDED = ("x_reference_px", "y_reference_px", "var_x_correction_px2", "cov_xy_correction_px2", "var_y_correction_px2",

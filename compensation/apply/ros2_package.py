@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib.resources
 from pathlib import Path
 
-from compensation.apply.runtime_export import export
-from compensation.drift.drift_model import DriftModel
-from foundation.files import make_folder, write_whole
+from thermostand.compensation.apply.runtime_export import export
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.foundation.files import make_folder, write_whole
 
 PACKAGE = "camera_drift"
 
@@ -39,7 +39,9 @@ def _made(folder: Path) -> Path:
 
 
 def _text(name: str) -> str:
-    return importlib.resources.files("compensation.apply").joinpath("ros2", name).read_text(encoding="utf-8")
+    return (
+        importlib.resources.files("thermostand.compensation.apply").joinpath("ros2", name).read_text(encoding="utf-8")
+    )
 
 
 def _version(model: DriftModel) -> str:

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from compensation import drift_runtime
-from compensation.drift.between_nights import BetweenNights
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.paper_model import PaperModel
-from compensation.drift.polynomial import exponents
-from compensation.drift.terms import Kind, Term
-from compensation.drift.thermal_model import ThermalModel
-from compensation.history.states import Float
-from foundation.files import make_folder, write_whole
+from thermostand.compensation import drift_runtime
+from thermostand.compensation.drift.between_nights import BetweenNights
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.drift.terms import Kind, Term
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.history.states import Float
+from thermostand.foundation.files import make_folder, write_whole
 
 MODEL_NAME, MODULE_NAME = "drift.json", "drift_runtime.py"
 
@@ -29,7 +29,7 @@ def export(model: DriftModel, folder: Path) -> tuple[Path, Path]:
     """
     make_folder(folder)
     written = folder / MODEL_NAME, folder / MODULE_NAME
-    module = importlib.resources.files("compensation") / MODULE_NAME
+    module = importlib.resources.files("thermostand.compensation") / MODULE_NAME
     write_whole(written[0], json.dumps(runtime_model(model), indent=1, allow_nan=False) + "\n")
     write_whole(written[1], module.read_text(encoding="utf-8"))
     return written

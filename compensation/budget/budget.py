@@ -8,14 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.budget.correction import granite_mm, indices, post_mm, refraction_px, target_strain, varied
-from compensation.budget.geometry import Geometry, StandTemperatures
-from compensation.budget.refraction import Index, ciddor_1996, edlen_1966, tilted_shift_mm
-from compensation.budget.repeatability import Repeatability, home_residuals, v0_repeats
-from compensation.budget.session_temperatures import capture_states, mean_state, states_at
-from foundation.errors import SessionError
-from markers.target import Target
-from recording.reading.session import Session
+from thermostand.compensation.budget.correction import (
+    granite_mm,
+    indices,
+    post_mm,
+    refraction_px,
+    target_strain,
+    varied,
+)
+from thermostand.compensation.budget.geometry import Geometry, StandTemperatures
+from thermostand.compensation.budget.refraction import Index, ciddor_1996, edlen_1966, tilted_shift_mm
+from thermostand.compensation.budget.repeatability import Repeatability, home_residuals, v0_repeats
+from thermostand.compensation.budget.session_temperatures import capture_states, mean_state, states_at
+from thermostand.foundation.errors import SessionError
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
 
 Effect = Callable[[StandTemperatures, Geometry], tuple[float, float]]
 """(state, geometry) -> (um on or of the target, px in the image)."""

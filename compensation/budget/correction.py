@@ -16,8 +16,8 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.budget.geometry import Geometry, Quantity, StandTemperatures
-from compensation.budget.refraction import Index, appears_px, ciddor_1996, saturation_Pa
+from thermostand.compensation.budget.geometry import Geometry, Quantity, StandTemperatures
+from thermostand.compensation.budget.refraction import Index, appears_px, ciddor_1996, saturation_Pa
 
 Float = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from foundation.documents import Document, load_document
+from thermostand.foundation.documents import Document, load_document
 
 
 class Quantity(Document):
@@ -81,6 +81,6 @@ class StandTemperatures:
 
 def load_geometry(name: str) -> Geometry:
     """The geometry of a file, or of an installed name (`paper`); ConfigError naming file and key."""
-    folder = Path(str(importlib.resources.files("configs"))) / "geometry"
+    folder = Path(str(importlib.resources.files("thermostand.configs"))) / "geometry"
     installed = folder / f"{name.removesuffix('.yaml')}.yaml"
     return load_document(installed if installed.is_file() and not Path(name).is_file() else Path(name), Geometry)

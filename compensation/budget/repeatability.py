@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.budget.session_temperatures import CaptureState, capture_states
-from compensation.one_camera import others_ns
-from foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE
-from foundation.items import Event
-from markers.detection import Detection, DetectionError, detect
-from markers.target import Target
-from recording.reading.session import Session
+from thermostand.compensation.budget.session_temperatures import CaptureState, capture_states
+from thermostand.compensation.one_camera import others_ns
+from thermostand.foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE
+from thermostand.foundation.items import Event
+from thermostand.markers.detection import Detection, DetectionError, detect
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
 
 
 @dataclass(frozen=True, slots=True)

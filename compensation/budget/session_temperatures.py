@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.budget.geometry import StandTemperatures
-from foundation.errors import SessionError
-from foundation.items import StepState
-from recording.reading.interpolation import interpolated
-from recording.reading.session import Session
+from thermostand.compensation.budget.geometry import StandTemperatures
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import StepState
+from thermostand.recording.reading.interpolation import interpolated
+from thermostand.recording.reading.session import Session
 
 _SENSORS = tuple(name.removesuffix("_degC") for name in StandTemperatures.__dataclass_fields__)
 

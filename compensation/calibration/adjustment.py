@@ -7,16 +7,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.board import Board
-from compensation.calibration.bundle import Scene, problem_of
-from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
-from compensation.calibration.hand_eye import table_from_poses
-from compensation.calibration.least_squares import Float, Solution, lengths_in_sigmas, minimise, next_discrepancy
-from compensation.calibration.opencv import calibrate_opencv
-from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.session_centres import Positions
-from compensation.calibration.stage_geometry import ERRORS, TableSigma
-from compensation.drift.hull import convex_hull
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.bundle import Scene, problem_of
+from thermostand.compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
+from thermostand.compensation.calibration.hand_eye import table_from_poses
+from thermostand.compensation.calibration.least_squares import (
+    Float,
+    Solution,
+    lengths_in_sigmas,
+    minimise,
+    next_discrepancy,
+)
+from thermostand.compensation.calibration.opencv import calibrate_opencv
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.stage_geometry import ERRORS, TableSigma
+from thermostand.compensation.drift.hull import convex_hull
 
 _ROUNDS = 10
 _OUTLIER = 8.0

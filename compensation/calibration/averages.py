@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.least_squares import Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.least_squares import Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

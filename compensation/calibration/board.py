@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.calibration.least_squares import Float
-from markers.corner_board import BoardOfCorners
-from markers.target import Target
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.markers.corner_board import BoardOfCorners
+from thermostand.markers.target import Target
 
 _POINT_mm = 1e-3
 

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.blocks import Slopes, equations_of
-from compensation.calibration.board import Board
-from compensation.calibration.least_squares import Float, whiteners
-from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.session_centres import Positions
-from compensation.calibration.stage_geometry import PARAMETERS, Table, TableSigma
+from thermostand.compensation.calibration.blocks import Slopes, equations_of
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.least_squares import Float, whiteners
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.stage_geometry import PARAMETERS, Table, TableSigma
 
 _LENS_PRIOR = 0.05
 _LENS_ORDERS = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])

@@ -7,9 +7,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from compensation.calibration.adjustment import Adjustment, adjust
-from compensation.calibration.board import board_of
-from compensation.calibration.model_scores import (
+from thermostand.compensation.calibration.adjustment import Adjustment, adjust
+from thermostand.compensation.calibration.board import board_of
+from thermostand.compensation.calibration.model_scores import (
     BROWN,
     RATIONAL,
     ModelScore,
@@ -21,11 +21,11 @@ from compensation.calibration.model_scores import (
     score_models,
     times_the_pinhole,
 )
-from compensation.calibration.rays import DEGREES, RayLens
-from compensation.calibration.session_centres import Positions
-from compensation.calibration.stage_geometry import TableSigma
-from compensation.calibration.uncertainty import Difference, UncertaintyMap, projection_uncertainty
-from markers.target import Target
+from thermostand.compensation.calibration.rays import DEGREES, RayLens
+from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.compensation.calibration.uncertainty import Difference, UncertaintyMap, projection_uncertainty
+from thermostand.markers.target import Target
 
 
 class Model(StrEnum):

@@ -12,16 +12,16 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from compensation.calibration.adjustment import Adjustment
-from compensation.calibration.board import Board
-from compensation.calibration.calibrate import Calibration
-from compensation.calibration.least_squares import Float
-from compensation.calibration.pinhole import NAMES, Pinhole
-from compensation.calibration.rays import RayLens, exponents
-from compensation.calibration.seen_area import NOT_SEEN
-from compensation.calibration.stage_geometry import ERRORS, PARAMETERS
-from compensation.drift.hull import is_area
-from compensation.sound_values import (
+from thermostand.compensation.calibration.adjustment import Adjustment
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.calibrate import Calibration
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.pinhole import NAMES, Pinhole
+from thermostand.compensation.calibration.rays import RayLens, exponents
+from thermostand.compensation.calibration.seen_area import NOT_SEEN
+from thermostand.compensation.calibration.stage_geometry import ERRORS, PARAMETERS
+from thermostand.compensation.drift.hull import is_area
+from thermostand.compensation.sound_values import (
     Hull,
     Length,
     NotNegative,
@@ -31,10 +31,10 @@ from compensation.sound_values import (
     check_within_image,
     shaped,
 )
-from foundation.documents import Document, load_json
-from foundation.errors import CalibrationError
-from foundation.files import write_whole
-from foundation.json_values import plain
+from thermostand.foundation.documents import Document, load_json
+from thermostand.foundation.errors import CalibrationError
+from thermostand.foundation.files import write_whole
+from thermostand.foundation.json_values import plain
 
 FORMAT = "thermostand camera"
 

@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from compensation.calibration.least_squares import Float
-from markers.eccentricity import centroid_offsets_px, disc_centres_by_homography_px
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.markers.eccentricity import centroid_offsets_px, disc_centres_by_homography_px
 
 Project = Callable[[Float], Float]
 """Points (..., 3) of the camera frame, mm -> pixels (..., 2)."""

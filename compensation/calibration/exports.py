@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import yaml
 
-from compensation.calibration.least_squares import Float, dense, minimise
-from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.uncertainty import grid_pixels
-from foundation.files import make_folder, write_whole
+from thermostand.compensation.calibration.least_squares import Float, dense, minimise
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.compensation.calibration.uncertainty import grid_pixels
+from thermostand.foundation.files import make_folder, write_whole
 
 _GRID_COLUMNS = 33
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.least_squares import Float
-from compensation.calibration.stage_geometry import Table
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.stage_geometry import Table
+from thermostand.foundation.errors import CalibrationError
 
 _LEAST_TURN_DEG = 5.0
 _LEAST_TRAVEL_MM = 10.0

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from foundation.errors import CalibrationError
+from thermostand.foundation.errors import CalibrationError
 
 Float = NDArray[np.float64]
 State = TypeVar("State")

@@ -9,15 +9,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.adjustment import Adjustment, adjust, start_of
-from compensation.calibration.board import Board
-from compensation.calibration.least_squares import Float
-from compensation.calibration.pose import Lens, find_pose
-from compensation.calibration.rays import DEGREES, RayLens, fit_rays
-from compensation.calibration.session_centres import Positions
-from compensation.calibration.stage_geometry import TableSigma
-from compensation.calibration.uncertainty import Difference, difference
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.adjustment import Adjustment, adjust, start_of
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.pose import Lens, find_pose
+from thermostand.compensation.calibration.rays import DEGREES, RayLens, fit_rays
+from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.compensation.calibration.uncertainty import Difference, difference
+from thermostand.foundation.errors import CalibrationError
 
 BROWN, RATIONAL = "pinhole, Brown", "pinhole, rational"
 _FOLDS = 5

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.least_squares import Float
-from compensation.calibration.pinhole import Pinhole
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.foundation.errors import CalibrationError
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 

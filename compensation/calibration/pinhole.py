@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.least_squares import Float
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """The order of a camera's vector: that of OpenCV and mrcal."""

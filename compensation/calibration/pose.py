@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.board import Board
-from compensation.calibration.centre_corrections import shifts_by_camera
-from compensation.calibration.least_squares import Float, dense, minimise, whiteners
-from compensation.calibration.rotation import crosses
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.centre_corrections import shifts_by_camera
+from thermostand.compensation.calibration.least_squares import Float, dense, minimise, whiteners
+from thermostand.compensation.calibration.rotation import crosses
+from thermostand.foundation.errors import CalibrationError
 
 _LEAST_MARKERS = 4
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from compensation.calibration.least_squares import Float
-from compensation.calibration.pinhole import Pinhole
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.foundation.errors import CalibrationError
 
 DEGREES = (3, 4, 5)
 _PROJECTIONS = 20

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.board import Board
-from compensation.calibration.bundle import lens_sigma
-from compensation.calibration.centre_corrections import shifts_by_camera
-from compensation.calibration.least_squares import Float, dense, minimise, next_discrepancy, whiteners
-from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.rotation import crosses
-from compensation.calibration.views import LEAST_MARKERS, POSE, Views, calibrate_views, inliers
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.bundle import lens_sigma
+from thermostand.compensation.calibration.centre_corrections import shifts_by_camera
+from thermostand.compensation.calibration.least_squares import Float, dense, minimise, next_discrepancy, whiteners
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.compensation.calibration.rotation import crosses
+from thermostand.compensation.calibration.views import LEAST_MARKERS, POSE, Views, calibrate_views, inliers
+from thermostand.foundation.errors import CalibrationError
 
 LEAST_COMMON = 3
 """Moments at which a camera and the first one both see the board: one fixes it, the others find mistakes."""

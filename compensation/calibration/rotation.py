@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.least_squares import Float
 
 
 def crosses(vectors: Float) -> Float:

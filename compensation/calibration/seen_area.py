@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.least_squares import Float
-from compensation.drift.hull import distances_px
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.drift.hull import distances_px
 
 NOT_SEEN = "not seen here (no marker was near, so nothing is known of the lens)"
 _BEYOND = 0.1

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
-from compensation.calibration.least_squares import Float
-from compensation.calibration.visits import AXES, place, visits_for
-from compensation.one_camera import others_ns
-from foundation.errors import CalibrationError, SessionError
-from foundation.progress import Report
-from markers.detection import Detection, DetectionError, detect
-from markers.target import Target
-from recording.format.decoded_items import frame_of
-from recording.reading.session import Session
+from thermostand.compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.visits import AXES, place, visits_for
+from thermostand.compensation.one_camera import others_ns
+from thermostand.foundation.errors import CalibrationError, SessionError
+from thermostand.foundation.progress import Report
+from thermostand.markers.detection import Detection, DetectionError, detect
+from thermostand.markers.target import Target
+from thermostand.recording.format.decoded_items import frame_of
+from thermostand.recording.reading.session import Session
 
 ROLE = "calibration"
 _LEAST_MARKERS = 12

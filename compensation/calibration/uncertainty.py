@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.adjustment import Adjustment
-from compensation.calibration.least_squares import Float
-from compensation.calibration.seen_area import seen
-from compensation.calibration.stage_geometry import ERRORS, PARAMETERS
+from thermostand.compensation.calibration.adjustment import Adjustment
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.seen_area import seen
+from thermostand.compensation.calibration.stage_geometry import ERRORS, PARAMETERS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.calibration.least_squares import Float
-from compensation.calibration.rotation import crosses
-from compensation.calibration.seen_area import NOT_SEEN, seen
-from compensation.calibration.views import POSE, ViewCalibration
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.rotation import crosses
+from thermostand.compensation.calibration.seen_area import NOT_SEEN, seen
+from thermostand.compensation.calibration.views import POSE, ViewCalibration
 
 COVERAGE = 2.0
 """k: an interval of two standard uncertainties holds 95 %."""

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.blocks import Slopes, equations_of
-from compensation.calibration.board import Board
-from compensation.calibration.bundle import lens_sigma
-from compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
-from compensation.calibration.least_squares import (
+from thermostand.compensation.calibration.blocks import Slopes, equations_of
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.bundle import lens_sigma
+from thermostand.compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
+from thermostand.compensation.calibration.least_squares import (
     Float,
     Solution,
     lengths_in_sigmas,
@@ -28,12 +28,12 @@ from compensation.calibration.least_squares import (
     next_discrepancy,
     whiteners,
 )
-from compensation.calibration.opencv import calibrate_opencv
-from compensation.calibration.pinhole import Pinhole
-from compensation.calibration.pose import find_pose
-from compensation.calibration.rotation import crosses
-from compensation.drift.hull import convex_hull
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.opencv import calibrate_opencv
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.compensation.calibration.pose import find_pose
+from thermostand.compensation.calibration.rotation import crosses
+from thermostand.compensation.drift.hull import convex_hull
+from thermostand.foundation.errors import CalibrationError
 
 POSE = 6
 """Parameters of a view: a turn (rad) and a shift (mm), in the camera's frame."""

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from foundation.errors import SessionError
-from foundation.items import StepMark, StepState
-from recording.reading.session import Session
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.recording.reading.session import Session
 
 Axis = Literal["linear", "rotary"]
 AXES: tuple[Axis, Axis] = ("linear", "rotary")

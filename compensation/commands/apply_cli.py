@@ -11,9 +11,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from compensation.apply.c_header import export_c
-from compensation.apply.compensate_images import Form, corrected_image, middle_flags, write_image
-from compensation.apply.compensate_points import (
+from thermostand.compensation.apply.c_header import export_c
+from thermostand.compensation.apply.compensate_images import Form, corrected_image, middle_flags, write_image
+from thermostand.compensation.apply.compensate_points import (
     CAMERA,
     X,
     Y,
@@ -22,25 +22,25 @@ from compensation.apply.compensate_points import (
     times,
     write_corrected,
 )
-from compensation.apply.ros2_package import export_ros2
-from compensation.apply.runtime_export import export
-from compensation.commands.options import CameraName, Incomplete, open_session
-from compensation.csv_rows import numbers
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.model_file import load_model
-from compensation.drift.paper_model import PaperModel
-from compensation.history.states import States
-from compensation.history.thermal_history import recorded_history, states_at
-from compensation.one_camera import name_of, own_frames, take
-from experiments.steps import Role
-from foundation.command_app import App
-from foundation.errors import ConfigError, SessionError
-from foundation.files import check_writable, whole_file
-from foundation.instants import parse_instant
-from foundation.output import say, show
-from foundation.progress import progress
-from markers.image_file import read_image
-from recording.reading.session import Session
+from thermostand.compensation.apply.ros2_package import export_ros2
+from thermostand.compensation.apply.runtime_export import export
+from thermostand.compensation.commands.options import CameraName, Incomplete, open_session
+from thermostand.compensation.csv_rows import numbers
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.model_file import load_model
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.history.states import States
+from thermostand.compensation.history.thermal_history import recorded_history, states_at
+from thermostand.compensation.one_camera import name_of, own_frames, take
+from thermostand.experiments.steps import Role
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.files import check_writable, whole_file
+from thermostand.foundation.instants import parse_instant
+from thermostand.foundation.output import say, show
+from thermostand.foundation.progress import progress
+from thermostand.markers.image_file import read_image
+from thermostand.recording.reading.session import Session
 
 app = App()
 

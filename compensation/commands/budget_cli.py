@@ -8,15 +8,15 @@ from typing import Annotated
 
 import typer
 
-from compensation.budget.budget import Budget, budget, table
-from compensation.budget.geometry import load_geometry
-from compensation.commands.options import CameraName, Incomplete, TargetOption, named_target, open_session
-from compensation.observations import session_target
-from compensation.one_camera import take
-from foundation.command_app import App
-from foundation.output import show
-from markers.target import Target
-from recording.reading.session import Session
+from thermostand.compensation.budget.budget import Budget, budget, table
+from thermostand.compensation.budget.geometry import load_geometry
+from thermostand.compensation.commands.options import CameraName, Incomplete, TargetOption, named_target, open_session
+from thermostand.compensation.observations import session_target
+from thermostand.compensation.one_camera import take
+from thermostand.foundation.command_app import App
+from thermostand.foundation.output import show
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
 
 app = App()
 

@@ -9,13 +9,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from compensation.calibration.calibrate import Calibration, Model, calibrate
-from compensation.calibration.camera_file import CameraFile, camera_file
-from compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
-from compensation.calibration.pinhole import NAMES
-from compensation.calibration.session_centres import observe_positions
-from compensation.calibration.stage_geometry import TableSigma
-from compensation.commands.options import (
+from thermostand.compensation.calibration.calibrate import Calibration, Model, calibrate
+from thermostand.compensation.calibration.camera_file import CameraFile, camera_file
+from thermostand.compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
+from thermostand.compensation.calibration.pinhole import NAMES
+from thermostand.compensation.calibration.session_centres import observe_positions
+from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.compensation.commands.options import (
     CameraName,
     Incomplete,
     TargetOption,
@@ -23,14 +23,14 @@ from compensation.commands.options import (
     named_target,
     open_session,
 )
-from compensation.observations import session_target
-from compensation.one_camera import serial_of
-from compensation.reporting.calibration_report import report_page
-from foundation.command_app import App
-from foundation.files import check_folder_writable, check_writable, write_whole
-from foundation.output import show
-from markers.target import Target
-from recording.reading.session import Session
+from thermostand.compensation.observations import session_target
+from thermostand.compensation.one_camera import serial_of
+from thermostand.compensation.reporting.calibration_report import report_page
+from thermostand.foundation.command_app import App
+from thermostand.foundation.files import check_folder_writable, check_writable, write_whole
+from thermostand.foundation.output import show
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
 
 app = App()
 

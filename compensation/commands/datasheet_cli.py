@@ -7,19 +7,19 @@ from typing import Annotated
 
 import typer
 
-from compensation.commands.options import CameraName, DetailsOption, Finding
-from compensation.datasheet.datasheet import datasheet
-from compensation.datasheet.details import load_details
-from compensation.drift.choosing import fit
-from compensation.drift.model_file import load_model
-from compensation.reporting.datasheet_page import datasheet_json, datasheet_page
-from compensation.reporting.equipment import equipment_of
-from compensation.reporting.pdf import pdf_of
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.files import check_writable, write_whole, write_whole_bytes
-from foundation.output import show
-from recording.reading.session import Session
+from thermostand.compensation.commands.options import CameraName, DetailsOption, Finding
+from thermostand.compensation.datasheet.datasheet import datasheet
+from thermostand.compensation.datasheet.details import load_details
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.model_file import load_model
+from thermostand.compensation.reporting.datasheet_page import datasheet_json, datasheet_page
+from thermostand.compensation.reporting.equipment import equipment_of
+from thermostand.compensation.reporting.pdf import pdf_of
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.files import check_writable, write_whole, write_whole_bytes
+from thermostand.foundation.output import show
+from thermostand.recording.reading.session import Session
 
 app = App()
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from compensation.commands.options import (
+from thermostand.compensation.commands.options import (
     Incomplete,
     MegapixelsOption,
     TargetOption,
@@ -18,20 +18,20 @@ from compensation.commands.options import (
     said_if,
     say_left_out,
 )
-from compensation.observations import read_frames, session_target
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.files import check_writable
-from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
-from foundation.output import show
-from foundation.progress import Report
-from foundation.usage import one_line
-from markers.detection import Detection, DetectionError, Image, detect, nothing_found
-from markers.detections_table import CENTRES, DetectedImage, write_detections
-from markers.image_file import read_image
-from markers.target import Target
-from recording.reading.session import Session
-from recording.reading.using import open_whole
+from thermostand.compensation.observations import read_frames, session_target
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.files import check_writable
+from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from thermostand.foundation.output import show
+from thermostand.foundation.progress import Report
+from thermostand.foundation.usage import one_line
+from thermostand.markers.detection import Detection, DetectionError, Image, detect, nothing_found
+from thermostand.markers.detections_table import CENTRES, DetectedImage, write_detections
+from thermostand.markers.image_file import read_image
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
+from thermostand.recording.reading.using import open_whole
 
 app = App()
 

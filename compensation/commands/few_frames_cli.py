@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from compensation.commands.options import CameraName, Finding
-from compensation.drift.anchoring import anchored, thermal_of
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.type_prior import fit_like as fit_like_units
-from foundation.command_app import App
-from foundation.files import check_writable
-from foundation.output import show
+from thermostand.compensation.commands.options import CameraName, Finding
+from thermostand.compensation.drift.anchoring import anchored, thermal_of
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.type_prior import fit_like as fit_like_units
+from thermostand.foundation.command_app import App
+from thermostand.foundation.files import check_writable
+from thermostand.foundation.output import show
 
 app = App()
 

@@ -7,24 +7,24 @@ from typing import Annotated
 
 import typer
 
-from compensation.centres_table import observations_of_table
-from compensation.commands.budget_cli import budgets_of_sessions
-from compensation.commands.options import CameraName, DetailsOption, Finding, named_target
-from compensation.datasheet.details import load_details
-from compensation.drift.bump import Bump
-from compensation.drift.choosing import Form, check_request
-from compensation.drift.choosing import fit as fit_model
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import Evaluation, evaluate, table
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.paper_model import MAX_DEGREE
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.unrepeated import Cause, find_unrepeated
-from compensation.observations import Observations
-from compensation.reporting.drawing.drawing import drawing
-from compensation.reporting.equipment import equipment_of
-from compensation.reporting.extras import Extras
-from compensation.reporting.report import (
+from thermostand.compensation.centres_table import observations_of_table
+from thermostand.compensation.commands.budget_cli import budgets_of_sessions
+from thermostand.compensation.commands.options import CameraName, DetailsOption, Finding, named_target
+from thermostand.compensation.datasheet.details import load_details
+from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.choosing import Form, check_request
+from thermostand.compensation.drift.choosing import fit as fit_model
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import Evaluation, evaluate, table
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.paper_model import MAX_DEGREE
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.unrepeated import Cause, find_unrepeated
+from thermostand.compensation.observations import Observations
+from thermostand.compensation.reporting.drawing.drawing import drawing
+from thermostand.compensation.reporting.equipment import equipment_of
+from thermostand.compensation.reporting.extras import Extras
+from thermostand.compensation.reporting.report import (
     NoModel,
     can_be_scored,
     check_report_writable,
@@ -32,13 +32,13 @@ from compensation.reporting.report import (
     numbers_path,
     write_report,
 )
-from compensation.reporting.table_positions import table_positions
-from compensation.validation3d.document import load_validation
-from foundation.command_app import App
-from foundation.errors import ConfigError, SessionError
-from foundation.files import check_writable
-from foundation.output import say, show
-from recording.reading.session import Session
+from thermostand.compensation.reporting.table_positions import table_positions
+from thermostand.compensation.validation3d.document import load_validation
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.files import check_writable
+from thermostand.foundation.output import say, show
+from thermostand.recording.reading.session import Session
 
 app = App()
 

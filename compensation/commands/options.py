@@ -11,16 +11,16 @@ from typing import Annotated
 
 import typer
 
-from compensation.finding.finder import finder
-from compensation.observations import Observations, observe
-from compensation.one_camera import take
-from foundation.errors import ConfigError
-from foundation.output import say
-from foundation.progress import Report, late_progress, progress
-from markers.detections_table import doubt
-from markers.target import Target, load_target
-from recording.reading.session import Session
-from recording.reading.using import Say, open_whole
+from thermostand.compensation.finding.finder import finder
+from thermostand.compensation.observations import Observations, observe
+from thermostand.compensation.one_camera import take
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.output import say
+from thermostand.foundation.progress import Report, late_progress, progress
+from thermostand.markers.detections_table import doubt
+from thermostand.markers.target import Target, load_target
+from thermostand.recording.reading.session import Session
+from thermostand.recording.reading.using import Say, open_whole
 
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
@@ -78,7 +78,7 @@ def installed_target(name: str) -> Target:
     """The target of a file, or of an installed name; ConfigError that lists what there is."""
     if Path(name).is_file():
         return load_target(Path(name))
-    folder = Path(str(importlib.resources.files("configs"))) / "targets"
+    folder = Path(str(importlib.resources.files("thermostand.configs"))) / "targets"
     known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
     if name.removesuffix(".yaml") not in known:
         raise ConfigError(f"{name}: no such file, and not one of the installed targets: {', '.join(known)}")
@@ -99,7 +99,7 @@ def said_if(incomplete: bool) -> Say | None:
 def finding_markers(count: int, *, is_quick: bool = False) -> Generator[Report]:
     """Progress of a search in so many images; is_quick: shown only once it has taken a while. What has to be compiled
     first is said, and no part of the time left."""
-    from markers.compile_ahead import compile_ahead  # numba takes long to load
+    from thermostand.markers.compile_ahead import compile_ahead  # numba takes long to load
 
     compile_ahead(
         lambda: say("the search for markers is compiled for this machine, which takes a moment; the result is kept")

@@ -9,24 +9,30 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from compensation.calibration.board import Board, board_of, board_of_corners
-from compensation.calibration.exports import EXPORTS, write_exports
-from compensation.calibration.least_squares import Float
-from compensation.calibration.model_scores import known_or_why
-from compensation.calibration.pinhole import NAMES
-from compensation.calibration.view_uncertainty import Known, known
-from compensation.calibration.views import LEAST_MARKERS, ViewCalibration, Views, calibrate_views, cross_validated_px
-from compensation.commands.options import MegapixelsOption, finding_markers, installed_target, say_left_out
-from foundation.command_app import App
-from foundation.errors import CalibrationError, ConfigError
-from foundation.files import check_folder_writable
-from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
-from foundation.output import show
-from foundation.progress import Report
-from markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
-from markers.detection import DetectionError, Image, detect
-from markers.image_file import read_image
-from markers.target import Target
+from thermostand.compensation.calibration.board import Board, board_of, board_of_corners
+from thermostand.compensation.calibration.exports import EXPORTS, write_exports
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.model_scores import known_or_why
+from thermostand.compensation.calibration.pinhole import NAMES
+from thermostand.compensation.calibration.view_uncertainty import Known, known
+from thermostand.compensation.calibration.views import (
+    LEAST_MARKERS,
+    ViewCalibration,
+    Views,
+    calibrate_views,
+    cross_validated_px,
+)
+from thermostand.compensation.commands.options import MegapixelsOption, finding_markers, installed_target, say_left_out
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import CalibrationError, ConfigError
+from thermostand.foundation.files import check_folder_writable
+from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from thermostand.foundation.output import show
+from thermostand.foundation.progress import Report
+from thermostand.markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
+from thermostand.markers.detection import DetectionError, Image, detect
+from thermostand.markers.image_file import read_image
+from thermostand.markers.target import Target
 
 app = App()
 

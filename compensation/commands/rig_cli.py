@@ -9,17 +9,17 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from compensation.calibration.exports import EXPORTS, write_exports
-from compensation.calibration.pinhole import NAMES
-from compensation.calibration.rig import RigCalibration, calibrate_rig
-from compensation.commands.options import MegapixelsOption, finding_markers, say_left_out
-from compensation.commands.photographs_cli import described, known_board, views_of
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.files import check_folder_writable, make_folder, write_whole
-from foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
-from foundation.output import show
-from foundation.progress import Report
+from thermostand.compensation.calibration.exports import EXPORTS, write_exports
+from thermostand.compensation.calibration.pinhole import NAMES
+from thermostand.compensation.calibration.rig import RigCalibration, calibrate_rig
+from thermostand.compensation.commands.options import MegapixelsOption, finding_markers, say_left_out
+from thermostand.compensation.commands.photographs_cli import described, known_board, views_of
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.files import check_folder_writable, make_folder, write_whole
+from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from thermostand.foundation.output import show
+from thermostand.foundation.progress import Report
 
 app = App()
 

@@ -10,11 +10,11 @@ from typing import Annotated
 import typer
 from pydantic import BaseModel
 
-from compensation.budget.geometry import Geometry
-from compensation.datasheet.details import Details
-from foundation.command_app import App
-from foundation.output import show
-from foundation.schemas import write_schemas
+from thermostand.compensation.budget.geometry import Geometry
+from thermostand.compensation.datasheet.details import Details
+from thermostand.foundation.command_app import App
+from thermostand.foundation.output import show
+from thermostand.foundation.schemas import write_schemas
 
 DOCUMENTS: Mapping[str, type[BaseModel]] = {"geometry": Geometry, "details": Details}
 
@@ -32,6 +32,6 @@ def schema(
 
     Example: compensate schema --out schema
     """
-    installed = Path(str(importlib.resources.files("configs"))) / "schema"
+    installed = Path(str(importlib.resources.files("thermostand.configs"))) / "schema"
     written = list(write_schemas(out or installed, DOCUMENTS))
     show(written, written)

@@ -8,23 +8,23 @@ from typing import Annotated
 
 import typer
 
-from compensation.budget.geometry import load_geometry
-from compensation.calibration.camera_file import load_camera
-from compensation.commands.options import Finding
-from compensation.drift.model_file import load_model
-from compensation.observations import Float
-from compensation.one_camera import name_of
-from compensation.reporting.validation_report import validation_page
-from compensation.validation3d.document import as_json
-from compensation.validation3d.stand_part import StandPart, stand_part
-from compensation.validation3d.validate import LensModel, camera_of, check_same, validate
-from compensation.validation3d.validation_frames import validation_frames
-from compensation.validation3d.validation_text import summary
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.files import check_writable, write_whole
-from foundation.output import say, show
-from recording.reading.session import Session
+from thermostand.compensation.budget.geometry import load_geometry
+from thermostand.compensation.calibration.camera_file import load_camera
+from thermostand.compensation.commands.options import Finding
+from thermostand.compensation.drift.model_file import load_model
+from thermostand.compensation.observations import Float
+from thermostand.compensation.one_camera import name_of
+from thermostand.compensation.reporting.validation_report import validation_page
+from thermostand.compensation.validation3d.document import as_json
+from thermostand.compensation.validation3d.stand_part import StandPart, stand_part
+from thermostand.compensation.validation3d.validate import LensModel, camera_of, check_same, validate
+from thermostand.compensation.validation3d.validation_frames import validation_frames
+from thermostand.compensation.validation3d.validation_text import summary
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.files import check_writable, write_whole
+from thermostand.foundation.output import say, show
+from thermostand.recording.reading.session import Session
 
 app = App()
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compensation.datasheet.motions import MOTIONS, UNITS, Visits
-from compensation.datasheet.quantity import Contribution, Quantity
+from thermostand.compensation.datasheet.motions import MOTIONS, UNITS, Visits
+from thermostand.compensation.datasheet.quantity import Contribution, Quantity
 
 NAMES = ("Shift of the image, I (right)", "Shift of the image, J (down)", "Scale of the image", "Turn of the image")
 _GROUP = "Temperature coefficients"

@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compensation.datasheet.coefficients import coefficients, curve
-from compensation.datasheet.details import Details
-from compensation.datasheet.left_over import hysteresis_quantities, residual_quantities
-from compensation.datasheet.motions import MOTIONS, Visits, Warming, motions, visits_of, warming_of
-from compensation.datasheet.quantity import Quantity, pooled
-from compensation.datasheet.warming import warming_quantities
-from compensation.drift.bumps import around_bumps
-from compensation.drift.choosing import FORMS
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import Evaluation, evaluate
-from compensation.drift.hysteresis import hysteresis
-from compensation.observations import Observations
-from foundation.errors import SessionError
+from thermostand.compensation.datasheet.coefficients import coefficients, curve
+from thermostand.compensation.datasheet.details import Details
+from thermostand.compensation.datasheet.left_over import hysteresis_quantities, residual_quantities
+from thermostand.compensation.datasheet.motions import MOTIONS, Visits, Warming, motions, visits_of, warming_of
+from thermostand.compensation.datasheet.quantity import Quantity, pooled
+from thermostand.compensation.datasheet.warming import warming_quantities
+from thermostand.compensation.drift.bumps import around_bumps
+from thermostand.compensation.drift.choosing import FORMS
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import Evaluation, evaluate
+from thermostand.compensation.drift.hysteresis import hysteresis
+from thermostand.compensation.observations import Observations
+from thermostand.foundation.errors import SessionError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from foundation.documents import Document, load_document
+from thermostand.foundation.documents import Document, load_document
 
 
 class Details(Document):

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from compensation.datasheet.quantity import Quantity, direct
-from compensation.datasheet.warming import UNREPEATED
-from compensation.drift.evaluation import Evaluation
-from compensation.drift.hysteresis import Hysteresis
-from compensation.observations import Float
+from thermostand.compensation.datasheet.quantity import Quantity, direct
+from thermostand.compensation.datasheet.warming import UNREPEATED
+from thermostand.compensation.drift.evaluation import Evaluation
+from thermostand.compensation.drift.hysteresis import Hysteresis
+from thermostand.compensation.observations import Float
 
 _FEWEST = 3
 

@@ -9,9 +9,9 @@ from itertools import groupby
 
 import numpy as np
 
-from compensation.drift.displacements import reference_centres
-from compensation.observations import Float, Mask, Observations
-from experiments.steps import Role
+from thermostand.compensation.drift.displacements import reference_centres
+from thermostand.compensation.observations import Float, Mask, Observations
+from thermostand.experiments.steps import Role
 
 SET_POINTS = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 MOTIONS = ("shift_I", "shift_J", "scale", "turn")

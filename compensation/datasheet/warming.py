@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from compensation.datasheet.coefficients import curve
-from compensation.datasheet.motions import MOTIONS, UNITS, Visits, Warming
-from compensation.datasheet.quantity import Contribution, Quantity, direct
-from compensation.observations import Float
+from thermostand.compensation.datasheet.coefficients import curve
+from thermostand.compensation.datasheet.motions import MOTIONS, UNITS, Visits, Warming
+from thermostand.compensation.datasheet.quantity import Contribution, Quantity, direct
+from thermostand.compensation.observations import Float
 
 UNREPEATED = "what the chosen form leaves unexplained"
 _GROUP = "Switching on"

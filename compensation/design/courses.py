@@ -8,8 +8,8 @@ from itertools import product
 
 import numpy as np
 
-from compensation.design.forecast import Situation, Surroundings, after
-from compensation.history.states import Float
+from thermostand.compensation.design.forecast import Situation, Surroundings, after
+from thermostand.compensation.history.states import Float
 
 _HORIZON_S = 8 * 3600.0
 _DRAWN = 40

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.states import Float, Memory, States
-from compensation.history.thermal_history import damped_least_squares, states_at
-from compensation.observations import Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.thermal_history import damped_least_squares, states_at
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 STEP_S = 60.0
 _AIR_TAU_S = 300.0

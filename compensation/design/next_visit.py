@@ -15,17 +15,17 @@ from typing import Literal
 
 import numpy as np
 
-from compensation.design.courses import Known, best_course
-from compensation.design.forecast import Situation, now, surroundings
-from compensation.design.wanted_states import wanted_states
-from compensation.drift.candidates import FEWEST_BETWEEN
-from compensation.drift.terms import Origin, features
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.history.states import Float
-from compensation.observations import Observations
-from experiments.steps import WANTED_STATES, Role, WantedState
-from foundation.errors import SessionError
+from thermostand.compensation.design.courses import Known, best_course
+from thermostand.compensation.design.forecast import Situation, now, surroundings
+from thermostand.compensation.design.wanted_states import wanted_states
+from thermostand.compensation.drift.candidates import FEWEST_BETWEEN
+from thermostand.compensation.drift.terms import Origin, features
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.history.states import Float
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import WANTED_STATES, Role, WantedState
+from thermostand.foundation.errors import SessionError
 
 _GRID = 13
 _APART_K = 1.0

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from foundation.errors import StandError
-from foundation.helper import go_behind_all_others
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.helper import go_behind_all_others
 
 LEFT_NAME = "stand-known-left"  # of a process whose daemon has gone
 
@@ -19,9 +19,9 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     Plain values: the daemon that reads them has nothing of this package."""
     import cv2
 
-    from compensation.design.next_visit import Wanted, decide
-    from compensation.design.unfinished_night import recorded_so_far
-    from experiments.steps import WANTED_STATES
+    from thermostand.compensation.design.next_visit import Wanted, decide
+    from thermostand.compensation.design.unfinished_night import recorded_so_far
+    from thermostand.experiments.steps import WANTED_STATES
 
     cv2.setNumThreads(1)
     wanted = Wanted(

@@ -10,12 +10,12 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from compensation.history.thermal_history import recorded_history
-from compensation.observations import Observations, observe
-from foundation.errors import SessionError
-from recording.format.layout import FINISHED, FRAMES, TELEMETRY, UNFINISHED
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_unfinished
+from thermostand.compensation.history.thermal_history import recorded_history
+from thermostand.compensation.observations import Observations, observe
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.layout import FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_unfinished
 
 
 def recorded_so_far(session: Path) -> Observations:

@@ -7,9 +7,9 @@ from itertools import product
 
 import numpy as np
 
-from compensation.design.forecast import Situation, Surroundings, after, at_rest, together
-from compensation.history.states import Memory
-from experiments.steps import WantedState
+from thermostand.compensation.design.forecast import Situation, Surroundings, after, at_rest, together
+from thermostand.compensation.history.states import Memory
+from thermostand.experiments.steps import WantedState
 
 _PLACES = 7
 _AFTER_S: dict[WantedState, float] = {"at_rest": 4 * 3600.0, "on_the_way": 2700.0}

@@ -12,17 +12,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from compensation.drift.condensed import condense_instants
-from compensation.drift.displacements import Displacements, displacements_from
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import check_same
-from compensation.drift.terms import MOTIONS, Kind, Origin, features
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.history.states import Float
-from compensation.observations import Mask, Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.drift.condensed import condense_instants
+from thermostand.compensation.drift.displacements import Displacements, displacements_from
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import check_same
+from thermostand.compensation.drift.terms import MOTIONS, Kind, Origin, features
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.states import Float
+from thermostand.compensation.observations import Mask, Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 _UNKNOWN_PX = 1.0
 _SAME_PLACE_PX = 10.0

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from compensation.drift.candidates import Pair
-from compensation.history.states import Float
+from thermostand.compensation.drift.candidates import Pair
+from thermostand.compensation.history.states import Float
 
 _LEAST_PX, _OF_DISCREPANCY = 0.002, 0.8
 """What a night leaves at set-points that were left out it leaves again, otherwise, on another one; and a little in any

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from foundation.documents import Document
+from thermostand.foundation.documents import Document
 
 MOTIONS = 4
 

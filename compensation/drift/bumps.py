@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from compensation.drift.bump import MOTIONS, Bump
-from compensation.drift.displacements import anchors
-from compensation.drift.night_series import Index, NightSeries, four_motions, night_series
-from compensation.drift.step_scan import Scan, Whitened, scan, whitened
-from compensation.history.states import Float
-from compensation.observations import Observations
-from foundation.errors import SessionError
+from thermostand.compensation.drift.bump import MOTIONS, Bump
+from thermostand.compensation.drift.displacements import anchors
+from thermostand.compensation.drift.night_series import Index, NightSeries, four_motions, night_series
+from thermostand.compensation.drift.step_scan import Scan, Whitened, scan, whitened
+from thermostand.compensation.history.states import Float
+from thermostand.compensation.observations import Observations
+from thermostand.foundation.errors import SessionError
 
 _GAIN, _GAIN_MARKER = 17.0, 25.0
 """Log likelihood that a step has to explain, chosen on nights of drawn cameras without any (numbers 2000 to 2079)."""

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from compensation.drift.displacements import Displacements
-from compensation.history.states import Float
-from foundation.documents import Document
+from thermostand.compensation.drift.displacements import Displacements
+from thermostand.compensation.history.states import Float
+from thermostand.foundation.documents import Document
 
 Pair = tuple[float, float]
 

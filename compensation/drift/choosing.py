@@ -8,19 +8,19 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from compensation.drift.bump import Bump
-from compensation.drift.bumps import around_bumps, find_bumps
-from compensation.drift.candidates import NO_MATTER_PX, Candidate, moving_rms_px
-from compensation.drift.displacements import displacements
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.paper_fit import check_degree, fit_paper, left_out
-from compensation.drift.paper_model import PaperModel
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import training
-from compensation.observations import Observations
-from experiments.steps import Role
-from foundation.errors import ConfigError, SessionError
+from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.bumps import around_bumps, find_bumps
+from thermostand.compensation.drift.candidates import NO_MATTER_PX, Candidate, moving_rms_px
+from thermostand.compensation.drift.displacements import displacements
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.paper_fit import check_degree, fit_paper, left_out
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import training
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import ConfigError, SessionError
 
 Form = Literal["paper", "thermal"]
 FORMS: tuple[Form, ...] = ("paper", "thermal")

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.displacements import Displacements
-from compensation.drift.terms import MOTIONS, motions
-from compensation.history.states import Float
-from compensation.observations import Mask, Observations
-from foundation.clock import NS_PER_S
+from thermostand.compensation.drift.displacements import Displacements
+from thermostand.compensation.drift.terms import MOTIONS, motions
+from thermostand.compensation.history.states import Float
+from thermostand.compensation.observations import Mask, Observations
+from thermostand.foundation.clock import NS_PER_S
 
 Index = NDArray[np.int64]
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.observations import Float, Mask, Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.observations import Float, Mask, Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 _ANCHOR_FRAMES = 20
 

@@ -11,10 +11,10 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.candidates import Candidate, Pair
-from compensation.drift.facts import ModelFacts
-from compensation.drift.hull import MARGIN_PX, distances_px
-from compensation.history.states import Float, Memory, States
+from thermostand.compensation.drift.candidates import Candidate, Pair
+from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.hull import MARGIN_PX, distances_px
+from thermostand.compensation.history.states import Float, Memory, States
 
 Flags = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

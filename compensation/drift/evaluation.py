@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.bumps import around_bumps
-from compensation.drift.candidates import Pair, pair_of, rms_px
-from compensation.drift.displacements import Displacements, displacements
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.paper_fit import degrees_for, left_out, scaling_of
-from compensation.drift.paper_model import PaperModel
-from compensation.drift.thermal_learning import left_out_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.observations import Float, Mask, Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.drift.bumps import around_bumps
+from thermostand.compensation.drift.candidates import Pair, pair_of, rms_px
+from thermostand.compensation.drift.displacements import Displacements, displacements
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.paper_fit import degrees_for, left_out, scaling_of
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.thermal_learning import left_out_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Float, Mask, Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 PAPER_BEFORE_PX = (0.191, 0.576)
 PAPER_AFTER_PX = (0.100, 0.090)

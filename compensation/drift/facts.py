@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.drift.bump import Bump
-from compensation.drift.candidates import Pair
-from compensation.drift.displacements import Displacements, reference_centres
-from compensation.drift.hull import convex_hull, is_area
-from compensation.history.states import Float
-from compensation.observations import Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.candidates import Pair
+from thermostand.compensation.drift.displacements import Displacements, reference_centres
+from thermostand.compensation.drift.hull import convex_hull, is_area
+from thermostand.compensation.history.states import Float
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

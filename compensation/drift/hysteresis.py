@@ -14,13 +14,13 @@ from itertools import combinations, groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.bumps import around_bumps
-from compensation.drift.displacements import displacements
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.training import frame_states
-from compensation.history.states import Float
-from compensation.observations import Mask, Observations
-from experiments.steps import Role
+from thermostand.compensation.drift.bumps import around_bumps
+from thermostand.compensation.drift.displacements import displacements
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.states import Float
+from thermostand.compensation.observations import Mask, Observations
+from thermostand.experiments.steps import Role
 
 _CYCLE = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 

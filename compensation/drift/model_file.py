@@ -14,18 +14,18 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
-from compensation.drift.between_nights import BetweenNights
-from compensation.drift.bump import Bump
-from compensation.drift.candidates import Candidate, Pair
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.facts import ModelFacts
-from compensation.drift.hull import is_area
-from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
-from compensation.drift.polynomial import exponents
-from compensation.drift.terms import MOTIONS, TERMS, Kind, Term
-from compensation.drift.thermal_model import ThermalModel, ThermalRange
-from compensation.drift_runtime import HOTTEST_degC
-from compensation.sound_values import (
+from thermostand.compensation.drift.between_nights import BetweenNights
+from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.candidates import Candidate, Pair
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.hull import is_area
+from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
+from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.drift.terms import MOTIONS, TERMS, Kind, Term
+from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange
+from thermostand.compensation.drift_runtime import HOTTEST_degC
+from thermostand.compensation.sound_values import (
     Degrees,
     Hull,
     NotNegative,
@@ -36,8 +36,8 @@ from compensation.sound_values import (
     check_within_image,
     shaped,
 )
-from foundation.documents import Document, load_json
-from foundation.files import write_whole
+from thermostand.foundation.documents import Document, load_json
+from thermostand.foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
 SCHEMA_VERSION = 9

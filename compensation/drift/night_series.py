@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.bump import MOTIONS
-from compensation.drift.displacements import Displacements, anchors, displacements
-from compensation.drift.terms import Kind, Origin, Term, features, motions
-from compensation.drift.training import frame_states
-from compensation.history.states import Float, Memory
-from compensation.observations import Mask, Observations
-from experiments.steps import Role
-from foundation.clock import NS_PER_S
+from thermostand.compensation.drift.bump import MOTIONS
+from thermostand.compensation.drift.displacements import Displacements, anchors, displacements
+from thermostand.compensation.drift.terms import Kind, Origin, Term, features, motions
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.observations import Mask, Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.clock import NS_PER_S
 
 Index = NDArray[np.int64]
 

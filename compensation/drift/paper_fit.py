@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means, pair_of
-from compensation.drift.displacements import Displacements, displacements
-from compensation.drift.facts import facts_of
-from compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
-from compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
-from compensation.observations import Observations
-from experiments.steps import Role
-from foundation.errors import ConfigError, SessionError
+from thermostand.compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means, pair_of
+from thermostand.compensation.drift.displacements import Displacements, displacements
+from thermostand.compensation.drift.facts import facts_of
+from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
+from thermostand.compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import ConfigError, SessionError
 
 _LEAST_TEMPERATURES = 3
 _LEAST_RANGE_K = 1.0

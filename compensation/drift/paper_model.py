@@ -13,11 +13,19 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from compensation.drift.candidates import Pair, check_folds
-from compensation.drift.drift_model import DriftModel, Flags, Outside, Situation, place_flags, range_flags, states_of
-from compensation.drift.polynomial import Float, Scaling, design
-from compensation.history.states import Memory
-from foundation.documents import Document
+from thermostand.compensation.drift.candidates import Pair, check_folds
+from thermostand.compensation.drift.drift_model import (
+    DriftModel,
+    Flags,
+    Outside,
+    Situation,
+    place_flags,
+    range_flags,
+    states_of,
+)
+from thermostand.compensation.drift.polynomial import Float, Scaling, design
+from thermostand.compensation.history.states import Memory
+from thermostand.foundation.documents import Document
 
 MAX_DEGREE = 5
 

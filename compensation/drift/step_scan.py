@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from compensation.history.states import Float
+from thermostand.compensation.history.states import Float
 
 _WANDER_H = 2.0
 _AMOUNTS_PX = (0.03, 0.15, 0.6)

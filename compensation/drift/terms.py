@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.states import Float, Memory, States
 
 MOTIONS = 8
 _QUICK_S = 240.0

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from compensation.drift.condensed import Index, Instants
-from compensation.drift.terms import MOTIONS, Term, width_group
-from compensation.history.states import Float
+from thermostand.compensation.drift.condensed import Index, Instants
+from thermostand.compensation.drift.terms import MOTIONS, Term, width_group
+from thermostand.compensation.history.states import Float
 
 _WANDERS, _WANDER_TAUS_S = (1.0, 2.0, 4.0), (1800.0, 7200.0)
 """Standard deviation of the wander over that of an instant's noise."""

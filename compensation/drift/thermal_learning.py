@@ -9,19 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.between_nights import between_nights
-from compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px, pair_of
-from compensation.drift.displacements import Displacements
-from compensation.drift.facts import facts_of
-from compensation.drift.terms import MOTIONS, PART_PLAYS, PLAYS_K, TAUS_S, TERMS, Kind, motions
-from compensation.drift.thermal_fit import Learned, learn
-from compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
-from compensation.drift.training import Training, self_heating_K, training
-from compensation.drift_runtime import SETTLED_TAUS
-from compensation.history.states import Float, Memory
-from compensation.observations import Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.drift.between_nights import between_nights
+from thermostand.compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px, pair_of
+from thermostand.compensation.drift.displacements import Displacements
+from thermostand.compensation.drift.facts import facts_of
+from thermostand.compensation.drift.terms import MOTIONS, PART_PLAYS, PLAYS_K, TAUS_S, TERMS, Kind, motions
+from thermostand.compensation.drift.thermal_fit import Learned, learn
+from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
+from thermostand.compensation.drift.training import Training, self_heating_K, training
+from thermostand.compensation.drift_runtime import SETTLED_TAUS
+from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 _FEWEST_FOLDS = 3
 _MOST_OF = 0.8

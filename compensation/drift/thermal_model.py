@@ -13,12 +13,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compensation.drift.between_nights import BetweenNights
-from compensation.drift.candidates import Pair
-from compensation.drift.drift_model import DriftModel, Flags, Outside, Situation, place_flags, range_flags, states_of
-from compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
-from compensation.drift_runtime import SETTLED_TAUS
-from compensation.history.states import Float, Memory, States
+from thermostand.compensation.drift.between_nights import BetweenNights
+from thermostand.compensation.drift.candidates import Pair
+from thermostand.compensation.drift.drift_model import (
+    DriftModel,
+    Flags,
+    Outside,
+    Situation,
+    place_flags,
+    range_flags,
+    states_of,
+)
+from thermostand.compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
+from thermostand.compensation.drift_runtime import SETTLED_TAUS
+from thermostand.compensation.history.states import Float, Memory, States
 
 _MORE_LEVERAGE = 3.0
 _MARGIN = 0.02

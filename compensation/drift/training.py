@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compensation.drift.candidates import between
-from compensation.drift.condensed import INSTANT_NS, Index, Instants, condense_instants
-from compensation.drift.displacements import Displacements, anchors, displacements
-from compensation.drift.terms import Kind, Origin, Term, features
-from compensation.history.states import Float, Memory, States
-from compensation.history.thermal_history import states_at
-from compensation.observations import Mask, Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.drift.candidates import between
+from thermostand.compensation.drift.condensed import INSTANT_NS, Index, Instants, condense_instants
+from thermostand.compensation.drift.displacements import Displacements, anchors, displacements
+from thermostand.compensation.drift.terms import Kind, Origin, Term, features
+from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.thermal_history import states_at
+from thermostand.compensation.observations import Mask, Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 _TRUSTED_S = 3600.0
 """After a gap the state is a guess; frames within this time teach nothing, unless the reference is one of them."""

@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from compensation.drift.candidates import Pair
-from compensation.drift.facts import facts_of
-from compensation.drift.terms import MOTIONS
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import training
-from compensation.history.states import Float
-from compensation.observations import Observations
-from foundation.errors import SessionError
+from thermostand.compensation.drift.candidates import Pair
+from thermostand.compensation.drift.facts import facts_of
+from thermostand.compensation.drift.terms import MOTIONS
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import training
+from thermostand.compensation.history.states import Float
+from thermostand.compensation.observations import Observations
+from thermostand.foundation.errors import SessionError
 
 _FEWEST = 3
 _APART = 0.1

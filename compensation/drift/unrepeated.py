@@ -16,11 +16,11 @@ from enum import StrEnum
 
 import numpy as np
 
-from compensation.drift.bump import Bump
-from compensation.drift.night_series import night_series
-from compensation.drift.step_scan import unexplained
-from compensation.observations import Observations
-from foundation.errors import SessionError
+from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.night_series import night_series
+from thermostand.compensation.drift.step_scan import unexplained
+from thermostand.compensation.observations import Observations
+from thermostand.foundation.errors import SessionError
 
 _LEAST_PX = 0.0025
 _ONE_LINE = 2.4

@@ -21,10 +21,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-import markers
-import markers.target
-from compensation.finding.piece import FoundMarkers, Piece
-from recording.format.records import FramePlace, frame_crcs
+import thermostand.markers.target
+from thermostand import markers
+from thermostand.compensation.finding.piece import FoundMarkers, Piece
+from thermostand.recording.format.records import FramePlace, frame_crcs
 
 
 def cache_folder() -> Path:
@@ -72,6 +72,6 @@ def _program() -> str:
     """A hash of what finds markers: our own text and the version of OpenCV."""
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     (folder,) = markers.__path__
-    for path in (*sorted(Path(folder).glob("*.py")), Path(str(markers.target.__file__))):
+    for path in (*sorted(Path(folder).glob("*.py")), Path(str(thermostand.markers.target.__file__))):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from compensation.finding.cache import cache_folder, keep, kept, key_of
-from compensation.finding.piece import FoundMarkers, Piece, frames_in_order
-from compensation.finding.workers import Work, in_processes, in_turn, on_cluster
-from foundation.errors import ConfigError
+from thermostand.compensation.finding.cache import cache_folder, keep, kept, key_of
+from thermostand.compensation.finding.piece import FoundMarkers, Piece, frames_in_order
+from thermostand.compensation.finding.workers import Work, in_processes, in_turn, on_cluster
+from thermostand.foundation.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.compiled import compiled
+from thermostand.markers.compiled import compiled
 
 Words = NDArray[np.uint64]
 Bytes = NDArray[np.uint8]

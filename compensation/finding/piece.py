@@ -19,17 +19,25 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from compensation.finding.png_rows import decode_rows
-from compensation.one_camera import others_ns
-from foundation.errors import SessionError
-from foundation.instants import local_text
-from markers.detection import Detection, DetectionError, Noise, detect, follow, nothing_found, rows_to_follow
-from markers.pixels import Mask
-from markers.target import Target
-from recording.format.damage import naming
-from recording.format.images import ImageArray, decode_image
-from recording.format.records import FramePlace, Message, frame_places, read_frame
-from recording.reading.session import Session
+from thermostand.compensation.finding.png_rows import decode_rows
+from thermostand.compensation.one_camera import others_ns
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.instants import local_text
+from thermostand.markers.detection import (
+    Detection,
+    DetectionError,
+    Noise,
+    detect,
+    follow,
+    nothing_found,
+    rows_to_follow,
+)
+from thermostand.markers.pixels import Mask
+from thermostand.markers.target import Target
+from thermostand.recording.format.damage import naming
+from thermostand.recording.format.images import ImageArray, decode_image
+from thermostand.recording.format.records import FramePlace, Message, frame_places, read_frame
+from thermostand.recording.reading.session import Session
 
 Float = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ import deflate
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.finding import filters, literals
-from compensation.finding.filters import LEFT, undo_filters
-from compensation.finding.literals import (
+from thermostand.compensation.finding import filters, literals
+from thermostand.compensation.finding.filters import LEFT, undo_filters
+from thermostand.compensation.finding.literals import (
     MOST_AT_ONCE,
     UNFIT,
     Bytes,
@@ -29,9 +29,9 @@ from compensation.finding.literals import (
     next_byte,
     opened,
 )
-from foundation.errors import SessionError
-from markers.compiled import compiled, digest, entry
-from recording.format.images import Header, ImageArray, StripPlaces, check_strip, pixel_data, strip_places
+from thermostand.foundation.errors import SessionError
+from thermostand.markers.compiled import compiled, digest, entry
+from thermostand.recording.format.images import Header, ImageArray, StripPlaces, check_strip, pixel_data, strip_places
 
 Mask = NDArray[np.bool_]
 Places = NDArray[np.int64]

@@ -17,8 +17,8 @@ from typing import Any
 
 import cv2
 
-from compensation.finding.piece import FoundMarkers, Piece, find_markers
-from foundation.errors import ConfigError, SessionError
+from thermostand.compensation.finding.piece import FoundMarkers, Piece, find_markers
+from thermostand.foundation.errors import ConfigError, SessionError
 
 Work = Callable[[Sequence[Piece]], Iterator[tuple[int, FoundMarkers]]]
 """Pieces -> (index, its markers), each piece once, in any order."""

@@ -8,10 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.history.states import Float, Memory, States
-from compensation.history.thermal_history import History, recorded_history, refined, states_at
-from compensation.sound_values import check_degC
-from recording.reading.session import Session
+from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.thermal_history import History, recorded_history, refined, states_at
+from thermostand.compensation.sound_values import check_degC
+from thermostand.recording.reading.session import Session
 
 Column = tuple[ArrayLike, ArrayLike]
 """Instants, ns, ascending, and values."""

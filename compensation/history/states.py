@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift_runtime import ThermalState
+from thermostand.compensation.drift_runtime import ThermalState
 
 Float = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.states import Float, Memory, States, row_of, state_of
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import StepState
-from recording.reading.interpolation import GAP_NS, interpolated
-from recording.reading.session import Session
+from thermostand.compensation.history.states import Float, Memory, States, row_of, state_of
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import StepState
+from thermostand.recording.reading.interpolation import GAP_NS, interpolated
+from thermostand.recording.reading.session import Session
 
 TimesNs = NDArray[np.int64]
 

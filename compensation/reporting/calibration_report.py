@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from compensation.calibration.calibrate import Calibration
-from compensation.calibration.camera_file import CameraFile
-from compensation.reporting.drawing import calibration_figures as figures
-from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Table, page
+from thermostand.compensation.calibration.calibrate import Calibration
+from thermostand.compensation.calibration.camera_file import CameraFile
+from thermostand.compensation.reporting.drawing import calibration_figures as figures
+from thermostand.compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Table, page
 
 _FIGURES = (
     (

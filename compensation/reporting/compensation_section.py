@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 from matplotlib.figure import Figure
 
-from compensation.drift.candidates import Candidate
-from compensation.drift.evaluation import Evaluation
-from compensation.observations import Observations
-from compensation.reporting.drawing import fit_figures as figures
-from compensation.reporting.drawing.path_figures import EXAGGERATION
-from compensation.reporting.numbers import (
+from thermostand.compensation.drift.candidates import Candidate
+from thermostand.compensation.drift.evaluation import Evaluation
+from thermostand.compensation.observations import Observations
+from thermostand.compensation.reporting.drawing import fit_figures as figures
+from thermostand.compensation.reporting.drawing.path_figures import EXAGGERATION
+from thermostand.compensation.reporting.numbers import (
     FormulaNumbers,
     ModelNumbers,
     Numbers,
@@ -20,7 +20,7 @@ from compensation.reporting.numbers import (
     percent,
     typeset,
 )
-from compensation.reporting.page import Drawing, Facts, Heading, Listing, Paragraph, Part, Table
+from thermostand.compensation.reporting.page import Drawing, Facts, Heading, Listing, Paragraph, Part, Table
 
 _FORMS = {
     "paper": "displacement to the reference = P(I, J, T), one polynomial per coordinate; T is the camera's temperature",

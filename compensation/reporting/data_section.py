@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from compensation.reporting.numbers import Numbers, SessionNumbers, UnusableFrames
-from compensation.reporting.page import Facts, Heading, Paragraph, Part, Table
+from thermostand.compensation.reporting.numbers import Numbers, SessionNumbers, UnusableFrames
+from thermostand.compensation.reporting.page import Facts, Heading, Paragraph, Part, Table
 
 _DOUBTFUL_BY_CHANCE = 0.02
 """Of the frames, at most: of 200 with noise alone 1 was doubtful (docs/decisions.md)."""

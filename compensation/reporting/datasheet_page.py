@@ -9,12 +9,12 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby
 
-from compensation.datasheet.datasheet import Datasheet
-from compensation.datasheet.quantity import COVERAGE, Quantity
-from compensation.reporting.drawing import datasheet_figures as figures
-from compensation.reporting.equipment import Line, stated
-from compensation.reporting.numbers import measured, percent, significant, typeset
-from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
+from thermostand.compensation.datasheet.datasheet import Datasheet
+from thermostand.compensation.datasheet.quantity import COVERAGE, Quantity
+from thermostand.compensation.reporting.drawing import datasheet_figures as figures
+from thermostand.compensation.reporting.equipment import Line, stated
+from thermostand.compensation.reporting.numbers import measured, percent, significant, typeset
+from thermostand.compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
 
 FORMAT = "thermostand datasheet 1"
 _LIBRARIES = ("thermostand", "numpy", "scipy", "opencv-python-headless")

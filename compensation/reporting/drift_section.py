@@ -7,15 +7,15 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from compensation.drift.hysteresis import Hysteresis
-from compensation.observations import Observations
-from compensation.reporting.drawing import drift_figures as figures
-from compensation.reporting.drawing.path_figures import EXAGGERATION, Paths, trajectories
-from compensation.reporting.numbers import Numbers, percent
-from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
-from compensation.reporting.result_section import ours
-from compensation.reporting.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
-from experiments.steps import Role
+from thermostand.compensation.drift.hysteresis import Hysteresis
+from thermostand.compensation.observations import Observations
+from thermostand.compensation.reporting.drawing import drift_figures as figures
+from thermostand.compensation.reporting.drawing.path_figures import EXAGGERATION, Paths, trajectories
+from thermostand.compensation.reporting.numbers import Numbers, percent
+from thermostand.compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table
+from thermostand.compensation.reporting.result_section import ours
+from thermostand.compensation.reporting.tracks import Track, WarmUp, cycle, moved_px, visits, warm_ups
+from thermostand.experiments.steps import Role
 
 _ROLLED_DEG = 1.0
 _MOST_PANELS = 4

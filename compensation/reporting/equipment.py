@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from compensation.datasheet.details import Details
-from foundation.documents import yaml_data
-from foundation.errors import ConfigError
-from foundation.events import DEVICE_IDENTITY
-from markers.target import Target
-from recording.reading.session import Session
+from thermostand.compensation.datasheet.details import Details
+from thermostand.foundation.documents import yaml_data
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.events import DEVICE_IDENTITY
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
 
 NOT_STATED = "not stated"
 Line = tuple[str, str]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from compensation.budget.budget import Budget
-from compensation.datasheet.details import Details
-from compensation.reporting.equipment import Line
-from compensation.reporting.table_positions import TablePositions
-from compensation.validation3d.validate import Validation
+from thermostand.compensation.budget.budget import Budget
+from thermostand.compensation.datasheet.details import Details
+from thermostand.compensation.reporting.equipment import Line
+from thermostand.compensation.reporting.table_positions import TablePositions
+from thermostand.compensation.validation3d.validate import Validation
 
 
 @dataclass(frozen=True, slots=True)

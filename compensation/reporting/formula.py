@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.paper_model import PaperModel
-from compensation.drift.polynomial import exponents
-from compensation.drift.terms import Kind, Term
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift_runtime import SPAN_K
-from compensation.reporting.numbers import FormulaNumbers
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.drift.terms import Kind, Term
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift_runtime import SPAN_K
+from thermostand.compensation.reporting.numbers import FormulaNumbers
 
 _MOTIONS = ("a₁", "a₂", "a₃", "a₄", "a₅", "a₆", "a₇", "a₈")
 

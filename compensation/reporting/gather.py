@@ -10,21 +10,21 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from compensation.drift.bump import Bump
-from compensation.drift.bumps import around_bumps, find_bumps
-from compensation.drift.candidates import pair_of, rms_px
-from compensation.drift.displacements import displacements
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
-from compensation.drift.hysteresis import hysteresis
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.drift.unrepeated import find_unrepeated
-from compensation.observations import Float, Mask, Observations
-from compensation.reporting.equipment import stated
-from compensation.reporting.extras import Extras
-from compensation.reporting.formula import formula_of
-from compensation.reporting.numbers import (
+from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.bumps import around_bumps, find_bumps
+from thermostand.compensation.drift.candidates import pair_of, rms_px
+from thermostand.compensation.drift.displacements import displacements
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import PAPER_AFTER_PX, PAPER_BEFORE_PX, Evaluation, improvement_percent
+from thermostand.compensation.drift.hysteresis import hysteresis
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.unrepeated import find_unrepeated
+from thermostand.compensation.observations import Float, Mask, Observations
+from thermostand.compensation.reporting.equipment import stated
+from thermostand.compensation.reporting.extras import Extras
+from thermostand.compensation.reporting.formula import formula_of
+from thermostand.compensation.reporting.numbers import (
     FORMAT,
     BumpNumbers,
     ModelNumbers,
@@ -35,10 +35,10 @@ from compensation.reporting.numbers import (
     UnusableFrames,
     WarmUpNumbers,
 )
-from compensation.reporting.tracks import WarmUp, warm_ups
-from compensation.validation3d.document import as_json as validation_json
-from experiments.steps import Role
-from markers.detection import Flag
+from thermostand.compensation.reporting.tracks import WarmUp, warm_ups
+from thermostand.compensation.validation3d.document import as_json as validation_json
+from thermostand.experiments.steps import Role
+from thermostand.markers.detection import Flag
 
 PAPER_WARM_UP_PX = (0.3, 1.1)
 """Mean drift of the paper's camera, not modified, while it warmed itself by 20 K at 24 degC (section 3.1)."""

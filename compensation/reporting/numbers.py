@@ -10,14 +10,14 @@ import math
 import re
 from dataclasses import dataclass
 
-from compensation.budget.budget import Budget
-from compensation.drift.candidates import Candidate
-from compensation.drift.evaluation import TemperatureRms
-from compensation.drift.hysteresis import Hysteresis
-from compensation.drift.unrepeated import Unrepeated
-from compensation.observations import Float
-from compensation.reporting.table_positions import TablePositions
-from foundation.json_values import plain
+from thermostand.compensation.budget.budget import Budget
+from thermostand.compensation.drift.candidates import Candidate
+from thermostand.compensation.drift.evaluation import TemperatureRms
+from thermostand.compensation.drift.hysteresis import Hysteresis
+from thermostand.compensation.drift.unrepeated import Unrepeated
+from thermostand.compensation.observations import Float
+from thermostand.compensation.reporting.table_positions import TablePositions
+from thermostand.foundation.json_values import plain
 
 FORMAT = "thermostand report 1"
 Pair = tuple[float, float]

@@ -12,7 +12,7 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
-from compensation.reporting.drawing.drawing import Draw, one_by_one
+from thermostand.compensation.reporting.drawing.drawing import Draw, one_by_one
 
 
 @dataclass(frozen=True, slots=True)

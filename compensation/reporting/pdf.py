@@ -6,7 +6,7 @@ import importlib
 import logging
 from typing import Any
 
-from foundation.errors import ConfigError
+from thermostand.foundation.errors import ConfigError
 
 
 def pdf_of(html: str) -> bytes:

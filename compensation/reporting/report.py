@@ -9,30 +9,34 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from compensation.budget.budget import Budget, Contribution
-from compensation.drift.choosing import fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import Evaluation, evaluate
-from compensation.drift.model_file import save_model
-from compensation.observations import Observations, Progress, observe
-from compensation.reporting.compensation_section import compensation_section, model_section, uncertainty_section
-from compensation.reporting.data_section import data_section, utc
-from compensation.reporting.drawing.drawing import Draw, one_by_one
-from compensation.reporting.drift_section import drift_section
-from compensation.reporting.equipment import equipment_of
-from compensation.reporting.extras import Extras
-from compensation.reporting.gather import numbers_of
-from compensation.reporting.numbers import Numbers, as_json
-from compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table, page
-from compensation.reporting.result_section import result_section
-from compensation.reporting.table_positions import TablePositions, positions_figure, table_positions
-from compensation.reporting.validation_report import validation_parts
-from compensation.validation3d.validate import Validation
-from experiments.steps import Role
-from foundation.errors import SessionError
-from foundation.files import check_writable, write_whole
-from markers.target import Target
-from recording.reading.session import Session
+from thermostand.compensation.budget.budget import Budget, Contribution
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import Evaluation, evaluate
+from thermostand.compensation.drift.model_file import save_model
+from thermostand.compensation.observations import Observations, Progress, observe
+from thermostand.compensation.reporting.compensation_section import (
+    compensation_section,
+    model_section,
+    uncertainty_section,
+)
+from thermostand.compensation.reporting.data_section import data_section, utc
+from thermostand.compensation.reporting.drawing.drawing import Draw, one_by_one
+from thermostand.compensation.reporting.drift_section import drift_section
+from thermostand.compensation.reporting.equipment import equipment_of
+from thermostand.compensation.reporting.extras import Extras
+from thermostand.compensation.reporting.gather import numbers_of
+from thermostand.compensation.reporting.numbers import Numbers, as_json
+from thermostand.compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table, page
+from thermostand.compensation.reporting.result_section import result_section
+from thermostand.compensation.reporting.table_positions import TablePositions, positions_figure, table_positions
+from thermostand.compensation.reporting.validation_report import validation_parts
+from thermostand.compensation.validation3d.validate import Validation
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import check_writable, write_whole
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
 
 
 class NoModel(SessionError):

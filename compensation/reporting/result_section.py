@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from compensation.drift.evaluation import improvement_percent
-from compensation.drift.unrepeated import Cause
-from compensation.reporting.numbers import Numbers, Pair, ScoreNumbers, percent
-from compensation.reporting.page import Heading, Paragraph, Part, Table
-from compensation.reporting.validation_report import gains_table
-from compensation.validation3d.validate import Validation
+from thermostand.compensation.drift.evaluation import improvement_percent
+from thermostand.compensation.drift.unrepeated import Cause
+from thermostand.compensation.reporting.numbers import Numbers, Pair, ScoreNumbers, percent
+from thermostand.compensation.reporting.page import Heading, Paragraph, Part, Table
+from thermostand.compensation.reporting.validation_report import gains_table
+from thermostand.compensation.validation3d.validate import Validation
 
 PAPER = (
     "Paper: Adamczyk et al., Temperature Compensation Method for Digital Cameras in 2D and 3D Measurement "

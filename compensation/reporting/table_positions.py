@@ -9,11 +9,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compensation.calibration.visits import visits_for
-from compensation.reporting.drawing.figures import FULL_WIDTH_IN, GREY, J_COLOUR, legend_above, new_figure, style
-from experiments.steps import Role
-from foundation.items import StepMark
-from markers.target import Target
+from thermostand.compensation.calibration.visits import visits_for
+from thermostand.compensation.reporting.drawing.figures import (
+    FULL_WIDTH_IN,
+    GREY,
+    J_COLOUR,
+    legend_above,
+    new_figure,
+    style,
+)
+from thermostand.experiments.steps import Role
+from thermostand.foundation.items import StepMark
+from thermostand.markers.target import Target
 
 _LABEL_MM = 12.0
 

@@ -10,9 +10,9 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.drift.displacements import reference_centres
-from compensation.observations import Float, Observations
-from experiments.steps import Role
+from thermostand.compensation.drift.displacements import reference_centres
+from thermostand.compensation.observations import Float, Observations
+from thermostand.experiments.steps import Role
 
 Rows = NDArray[np.int64]
 

@@ -7,15 +7,15 @@ from itertools import chain
 
 import numpy as np
 
-from compensation.drift.drift_model import Outside
-from compensation.drift.evaluation import improvement_percent
-from compensation.observations import Float
-from compensation.reporting.drawing import validation_figures as figures
-from compensation.reporting.numbers import percent
-from compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
-from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from compensation.validation3d.validate import Validation
-from compensation.validation3d.validation_text import flagged, reason_names, with_limit
+from thermostand.compensation.drift.drift_model import Outside
+from thermostand.compensation.drift.evaluation import improvement_percent
+from thermostand.compensation.observations import Float
+from thermostand.compensation.reporting.drawing import validation_figures as figures
+from thermostand.compensation.reporting.numbers import percent
+from thermostand.compensation.reporting.page import Drawing, Facts, Heading, Paragraph, Part, Table, page
+from thermostand.compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
+from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validation_text import flagged, reason_names, with_limit
 
 _HEADS = ("Temp., °C", "Pos.", *(f"{axis} {when}, mm" for when in ("before", "after") for axis in figures.AXES))
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
-from compensation.calibration.board import Board
-from compensation.calibration.pose import Lens
-from compensation.observations import Float, Observations
-from compensation.validation3d.poses import Doubts, Found, find, middle_mm, rotation_mrad
-from compensation.validation3d.validation_frames import FrameIndices, ValidationFrames
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.pose import Lens
+from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.validation3d.poses import Doubts, Found, find, middle_mm, rotation_mrad
+from thermostand.compensation.validation3d.validation_frames import FrameIndices, ValidationFrames
+from thermostand.foundation.errors import CalibrationError
 
 _LEAST_MARKERS = 12
 

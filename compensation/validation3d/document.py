@@ -12,15 +12,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from compensation.drift.drift_model import Outside
-from compensation.observations import Float
-from compensation.validation3d.deviations import Deviations
-from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from compensation.validation3d.validate import Validation
-from compensation.validation3d.validation_text import reason_names
-from foundation.documents import Document, load_json
-from foundation.errors import SessionError
-from foundation.json_values import plain
+from thermostand.compensation.drift.drift_model import Outside
+from thermostand.compensation.observations import Float
+from thermostand.compensation.validation3d.deviations import Deviations
+from thermostand.compensation.validation3d.paper import AFTER_mm, BEFORE_mm
+from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validation_text import reason_names
+from thermostand.foundation.documents import Document, load_json
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.json_values import plain
 
 _AXES = "of the calibrated camera: X right and Y down in the image, Z away from the camera"
 _WRITTEN_AS = {"repeat_um": "v0_again_um"}  # fields of Deviations

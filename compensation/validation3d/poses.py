@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from compensation.calibration.averages import MeanCentres
-from compensation.calibration.board import Board
-from compensation.calibration.least_squares import Float
-from compensation.calibration.pose import Lens, Pose, find_pose
-from compensation.calibration.rotation import crosses
+from thermostand.compensation.calibration.averages import MeanCentres
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.pose import Lens, Pose, find_pose
+from thermostand.compensation.calibration.rotation import crosses
 
 _CORRELATED = 1 / 2
 """Of the image's width: over this distance errors of a drift model are taken to be alike."""

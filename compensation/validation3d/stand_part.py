@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.budget.correction import displacement_px, varied
-from compensation.budget.geometry import Geometry, Quantity, StandTemperatures
-from compensation.budget.session_temperatures import mean_state, states_at
-from compensation.observations import Float, Observations
-from compensation.validation3d.validation_frames import ValidationFrames
-from foundation.errors import SessionError
-from recording.reading.session import Session
+from thermostand.compensation.budget.correction import displacement_px, varied
+from thermostand.compensation.budget.geometry import Geometry, Quantity, StandTemperatures
+from thermostand.compensation.budget.session_temperatures import mean_state, states_at
+from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.validation3d.validation_frames import ValidationFrames
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.session import Session
 
 
 @dataclass(frozen=True, slots=True, eq=False)

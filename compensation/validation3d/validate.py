@@ -13,16 +13,16 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.camera_file import CameraFile
-from compensation.calibration.model_scores import ray_name
-from compensation.calibration.pose import find_pose
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.training import frame_states
-from compensation.observations import Float, Observations
-from compensation.validation3d.deviations import Camera, Deviations, deviations
-from compensation.validation3d.stand_part import StandPart
-from compensation.validation3d.validation_frames import ValidationFrames
-from foundation.errors import SessionError
+from thermostand.compensation.calibration.camera_file import CameraFile
+from thermostand.compensation.calibration.model_scores import ray_name
+from thermostand.compensation.calibration.pose import find_pose
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.validation3d.deviations import Camera, Deviations, deviations
+from thermostand.compensation.validation3d.stand_part import StandPart
+from thermostand.compensation.validation3d.validation_frames import ValidationFrames
+from thermostand.foundation.errors import SessionError
 
 StandAt = Callable[[Float], StandPart | None]
 """(distances of the positions (P,), mm) -> the stand's part in their frames, None when it was not asked for."""

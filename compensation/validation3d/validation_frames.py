@@ -8,11 +8,11 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.visits import Visit, place, visits_for
-from compensation.observations import Float, Observations
-from experiments.steps import Role
-from foundation.errors import SessionError
-from recording.reading.session import Session
+from thermostand.compensation.calibration.visits import Visit, place, visits_for
+from thermostand.compensation.observations import Float, Observations
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.session import Session
 
 FrameIndices = NDArray[np.int64]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from compensation.drift.drift_model import Outside
-from compensation.observations import Float
-from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from compensation.validation3d.validate import Validation
+from thermostand.compensation.drift.drift_model import Outside
+from thermostand.compensation.observations import Float
+from thermostand.compensation.validation3d.paper import AFTER_mm, BEFORE_mm
+from thermostand.compensation.validation3d.validate import Validation
 
 
 def summary(validation: Validation) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivers.devices.relays import CAMERA_POWER
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import Refused
-from foundation.readings import Reading
+from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import Refused
+from thermostand.foundation.readings import Reading
 
 _PERMIT, _COMPRESSOR = "heater_enable", "compressor"
 

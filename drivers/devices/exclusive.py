@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from types import TracebackType
 
-from foundation.errors import Unreachable
+from thermostand.foundation.errors import Unreachable
 
 
 class Exclusive:

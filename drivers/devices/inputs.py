@@ -7,14 +7,14 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.settings import DeviceName, Identity, Line, OnBus
-from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit
-from drivers.wires.registers import RegisterMap
-from foundation.clock import Clock
-from foundation.documents import Document
-from foundation.errors import ConfigError, Unreachable
-from foundation.readings import Reading
+from thermostand.drivers.settings import DeviceName, Identity, Line, OnBus
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.modbus_unit import ModbusUnit
+from thermostand.drivers.wires.registers import RegisterMap
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError, Unreachable
+from thermostand.foundation.readings import Reading
 
 
 class ContactSettings(Document):

@@ -17,15 +17,15 @@ from typing import Literal
 
 from pydantic import Field
 
-from drivers.devices.thermometers import Calibration
-from drivers.settings import Identity, Polled, PollPeriod_s, same_device
-from drivers.wires.line_client import LineClient
-from drivers.wires.link import SerialSettings
-from foundation.addresses import ByteAddress
-from foundation.calls import Lane
-from foundation.clock import Clock, call_pause_s
-from foundation.errors import Refused, Unreachable
-from foundation.readings import Reading, bad_reading
+from thermostand.drivers.devices.thermometers import Calibration
+from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, same_device
+from thermostand.drivers.wires.line_client import LineClient
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.addresses import ByteAddress
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock, call_pause_s
+from thermostand.foundation.errors import Refused, Unreachable
+from thermostand.foundation.readings import Reading, bad_reading
 
 _GAP_S = 0.02
 _FAILED = re.compile(r"\*+")  # in the place of a number: not measured

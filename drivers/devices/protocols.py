@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from drivers.devices.in_force import InForce
-from drivers.settings import CameraSettings, Identity
-from foundation.readings import Frame, Reading
+from thermostand.drivers.devices.in_force import InForce
+from thermostand.drivers.settings import CameraSettings, Identity
+from thermostand.foundation.readings import Frame, Reading
 
 
 class Device(Protocol):

@@ -8,12 +8,12 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.settings import Identity, OnBus, PollPeriod_s
-from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit
-from drivers.wires.registers import Point, RegisterMap
-from foundation.errors import ConfigError, DeviceError, DeviceFault, Unreachable
-from foundation.readings import Reading
+from thermostand.drivers.settings import Identity, OnBus, PollPeriod_s
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.modbus_unit import ModbusUnit
+from thermostand.drivers.wires.registers import Point, RegisterMap
+from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Unreachable
+from thermostand.foundation.readings import Reading
 
 COIL_ON = 0xFF00
 COIL_OFF = 0x0000

@@ -8,14 +8,14 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from drivers.settings import Identity, Line, OnBus, Range
-from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit, Sample
-from drivers.wires.registers import RegisterMap
-from foundation.clock import Clock
-from foundation.documents import Document
-from foundation.errors import ConfigError, DeviceError, Unreachable
-from foundation.readings import Quality, Reading, bad_reading
+from thermostand.drivers.settings import Identity, Line, OnBus, Range
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.modbus_unit import ModbusUnit, Sample
+from thermostand.drivers.wires.registers import RegisterMap
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
+from thermostand.foundation.readings import Quality, Reading, bad_reading
 
 PLAUSIBLE_DEGC = (-40.0, 100.0)
 

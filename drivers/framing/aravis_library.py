@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from foundation.errors import StandError
+from thermostand.foundation.errors import StandError
 
 ARAVIS_SONAMES = ("libaravis-0.8.so.0", "libaravis-0.10.so.0")
 DEVICE_ERRORS = "arv-device-error-quark"

@@ -1,10 +1,11 @@
-"""`python -m drivers.sim`: one process is one simulated laboratory. Its description comes as JSON on standard input.
+"""`python -m thermostand.drivers.sim`: one process is one simulated laboratory. Its description comes as JSON on
+standard input.
 
 Prints the addresses at which it answers (JSON, one line) when every fake does; ends on SIGTERM, SIGINT or the control
 socket's `quit`; exits with 2 and one line when it cannot start. When its parent process dies, it lives on for a minute,
 as a real laboratory would: long enough to see the heater's dead-man drop.
 
-`python -m drivers.sim --faults` prints the table of faults (JSON) instead.
+`python -m thermostand.drivers.sim --faults` prints the table of faults (JSON) instead.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ import os
 import signal
 import sys
 
-from drivers.sim.control import serve_control
-from drivers.sim.fault_schedule import FaultSchedule, parse_fault
-from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_faults import table
-from drivers.sim.laboratory_spec import LaboratorySpec
-from foundation.documents import parse_document
-from foundation.ending import Ending
-from foundation.errors import ConfigError
+from thermostand.drivers.sim.control import serve_control
+from thermostand.drivers.sim.fault_schedule import FaultSchedule, parse_fault
+from thermostand.drivers.sim.laboratory import Laboratory
+from thermostand.drivers.sim.laboratory_faults import table
+from thermostand.drivers.sim.laboratory_spec import LaboratorySpec
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.ending import Ending
+from thermostand.foundation.errors import ConfigError
 
 _ORPHAN_LIMIT_S = 60.0
 _TICK_S = 0.1

@@ -18,13 +18,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
-from drivers.sim.fault_schedule import FaultSchedule
-from drivers.sim.faults import LinkFaults
-from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_faults import FAULTS, inject, table
-from drivers.sim.wire import Lines, TcpWire
-from foundation.addresses import tcp_place
-from foundation.errors import ConfigError
+from thermostand.drivers.sim.fault_schedule import FaultSchedule
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.laboratory import Laboratory
+from thermostand.drivers.sim.laboratory_faults import FAULTS, inject, table
+from thermostand.drivers.sim.wire import Lines, TcpWire
+from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.errors import ConfigError
 
 
 class Control:

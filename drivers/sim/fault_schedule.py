@@ -17,11 +17,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_fault import Once
-from drivers.sim.laboratory_faults import FAULTS, inject
-from foundation.clock import seconds_ns
-from foundation.errors import ConfigError
+from thermostand.drivers.sim.laboratory import Laboratory
+from thermostand.drivers.sim.laboratory_fault import Once
+from thermostand.drivers.sim.laboratory_faults import FAULTS, inject
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import ConfigError
 
 _TIME = r"(\d+(?:\.\d+)?)(s|min|h)?"
 _FORM = re.compile(rf"([A-Za-z_]+\.[A-Za-z_]+)(?:=(.+?))?(?:@{_TIME})?(?::{_TIME})?")

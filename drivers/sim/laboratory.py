@@ -11,35 +11,35 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.gige.camera import FakeCamera
-from drivers.sim.gige.genicam_file import read_genicam
-from drivers.sim.gige.switch import Switch
-from drivers.sim.laboratory_spec import ChamberUnitSpec, LaboratorySpec
-from drivers.sim.link_faults import Link
-from drivers.sim.motion.flap import FakeFlap
-from drivers.sim.motion.ximc import FakeAxis
-from drivers.sim.physics.optics import CameraKind, true_centres_px
-from drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
-from drivers.sim.physics.published_camera import PublishedCamera
-from drivers.sim.physics.scene import Scene, SceneSpec, still
-from drivers.sim.units.adam_4015 import FakeAdam4015
-from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
-from drivers.sim.units.heat_module import FakeHeatModule
-from drivers.sim.units.julabo_circulator import FakeJulabo
-from drivers.sim.units.modbus import RtuEngine, TcpEngine, Unit
-from drivers.sim.units.probes import FakeProbe
-from drivers.sim.units.regulator import FakeRegulator
-from drivers.sim.units.relays import FakeRelays
-from drivers.sim.units.rtd_sensors import CHANNELS
-from drivers.sim.units.simserv_chamber import FakeSimserv
-from drivers.sim.units.thermal_imager import FakeThermalImager
-from drivers.sim.units.thermometers import FakeThermometers
-from drivers.sim.usb import UsbServer
-from drivers.sim.wire import Engine, PtyWire, TcpWire
-from foundation.addresses import tcp_place
-from foundation.clock import FollowedClock, WallClock
-from foundation.errors import ConfigError
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.sim.gige.genicam_file import read_genicam
+from thermostand.drivers.sim.gige.switch import Switch
+from thermostand.drivers.sim.laboratory_spec import ChamberUnitSpec, LaboratorySpec
+from thermostand.drivers.sim.link_faults import Link
+from thermostand.drivers.sim.motion.flap import FakeFlap
+from thermostand.drivers.sim.motion.ximc import FakeAxis
+from thermostand.drivers.sim.physics.optics import CameraKind, true_centres_px
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
+from thermostand.drivers.sim.physics.published_camera import PublishedCamera
+from thermostand.drivers.sim.physics.scene import Scene, SceneSpec, still
+from thermostand.drivers.sim.units.adam_4015 import FakeAdam4015
+from thermostand.drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
+from thermostand.drivers.sim.units.heat_module import FakeHeatModule
+from thermostand.drivers.sim.units.julabo_circulator import FakeJulabo
+from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, Unit
+from thermostand.drivers.sim.units.probes import FakeProbe
+from thermostand.drivers.sim.units.regulator import FakeRegulator
+from thermostand.drivers.sim.units.relays import FakeRelays
+from thermostand.drivers.sim.units.rtd_sensors import CHANNELS
+from thermostand.drivers.sim.units.simserv_chamber import FakeSimserv
+from thermostand.drivers.sim.units.thermal_imager import FakeThermalImager
+from thermostand.drivers.sim.units.thermometers import FakeThermometers
+from thermostand.drivers.sim.usb import UsbServer
+from thermostand.drivers.sim.wire import Engine, PtyWire, TcpWire
+from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.clock import FollowedClock, WallClock
+from thermostand.foundation.errors import ConfigError
 
 # How fast frames leave: as a camera's readout in real time; in virtual time nothing else moves meanwhile.
 _PACE_MBps = {False: 40.0, True: 120.0}

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from operator import attrgetter
 
-from drivers.sim.laboratory import Laboratory
+from thermostand.drivers.sim.laboratory import Laboratory
 
 Setter = Callable[[Laboratory, object], None]
 

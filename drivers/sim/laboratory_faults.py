@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator
 
 from pydantic import TypeAdapter
 
-from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_fault import Fault, Setter, flag, given, number, number_or_none, once, shown, to
-from drivers.sim.link_faults import LINK_FAULTS, set_link_fault
-from drivers.sim.motion.flap import ERROR_FEEDBACK_DISCONNECT, ERROR_HARD_OVER_CURRENT, ERROR_NO_POWER
-from drivers.sim.motion.ximc import FakeAxis
-from drivers.sim.motion.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
-from drivers.sim.units.thermal_imager import SERIAL_NUMBER
-from foundation.clock import seconds_ns
+from thermostand.drivers.sim.laboratory import Laboratory
+from thermostand.drivers.sim.laboratory_fault import Fault, Setter, flag, given, number, number_or_none, once, shown, to
+from thermostand.drivers.sim.link_faults import LINK_FAULTS, set_link_fault
+from thermostand.drivers.sim.motion.flap import ERROR_FEEDBACK_DISCONNECT, ERROR_HARD_OVER_CURRENT, ERROR_NO_POWER
+from thermostand.drivers.sim.motion.ximc import FakeAxis
+from thermostand.drivers.sim.motion.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
+from thermostand.drivers.sim.units.thermal_imager import SERIAL_NUMBER
+from thermostand.foundation.clock import seconds_ns
 
 _AXES = ("linear", "rotary")
 _AIR = "air"

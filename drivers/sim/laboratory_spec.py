@@ -8,11 +8,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from drivers.camera_preset import CameraPreset, Effect
-from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151, Profile
-from drivers.sim.physics.optics import CameraKind
-from drivers.sim.units.probes import ProbeKind
-from foundation.documents import Document
+from thermostand.drivers.camera_preset import CameraPreset, Effect
+from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151, Profile
+from thermostand.drivers.sim.physics.optics import CameraKind
+from thermostand.drivers.sim.units.probes import ProbeKind
+from thermostand.foundation.documents import Document
 
 PROFILES = {"8MT160-300": LINEAR_8MT160_300, "8MR151": ROTARY_8MR151}
 

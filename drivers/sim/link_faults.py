@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
 
 _MIXED = ("drop", "flip", "cut", "junk", "late")
 

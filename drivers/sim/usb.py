@@ -26,9 +26,9 @@ from typing import Protocol
 from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import Lines, TcpWire
-from foundation.addresses import tcp_place
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import Lines, TcpWire
+from thermostand.foundation.addresses import tcp_place
 
 GET_DESCRIPTOR_IN, GET_DESCRIPTOR, STRING_DESCRIPTOR = 0x80, 6, 3
 LANGUAGES = b"\x04\x03\x09\x04"  # one language: English (United States)

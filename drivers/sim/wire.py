@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.faults import LinkFaults
 
 
 class Engine(Protocol):

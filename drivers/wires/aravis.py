@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.framing.aravis_library import Functions, library
-from drivers.wires.camera_settings import BITS_PER_PIXEL, PixelFormat, frame_bytes
+from thermostand.drivers.framing.aravis_library import Functions, library
+from thermostand.drivers.wires.camera_settings import BITS_PER_PIXEL, PixelFormat, frame_bytes
 
 PACKET_SOCKET_DISABLED = 1  # ArvGvStreamOption: else root would get AF_PACKET and everyone else a UDP socket
 PACKET_SIZE_ADJUSTMENT_NEVER = 0  # ArvGvPacketSizeAdjustment

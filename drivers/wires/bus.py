@@ -13,11 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from drivers.wires.modbus_client import BusSettings, FaultKind, ModbusClient, WireFault
-from drivers.wires.registers import Space
-from foundation.calls import Lane
-from foundation.clock import Clock, call_pause_s, seconds_ns
-from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
+from thermostand.drivers.wires.modbus_client import BusSettings, FaultKind, ModbusClient, WireFault
+from thermostand.drivers.wires.registers import Space
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock, call_pause_s, seconds_ns
+from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 __all__ = ["Bus", "BusCounters", "BusSettings"]
 

@@ -6,15 +6,15 @@ import math
 from collections.abc import Iterable
 from pathlib import Path
 
-from drivers.framing.aravis_library import AravisError
-from drivers.settings import Identity
-from drivers.wires import camera_dialects as words
-from drivers.wires.aravis import FLOAT_KINDS, GigeDevice
-from drivers.wires.camera_errors import is_silence
-from drivers.wires.camera_line import packet_delay_ns
-from drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
-from foundation.clock import NS_PER_S
-from foundation.errors import Refused
+from thermostand.drivers.framing.aravis_library import AravisError
+from thermostand.drivers.settings import Identity
+from thermostand.drivers.wires import camera_dialects as words
+from thermostand.drivers.wires.aravis import FLOAT_KINDS, GigeDevice
+from thermostand.drivers.wires.camera_errors import is_silence
+from thermostand.drivers.wires.camera_line import packet_delay_ns
+from thermostand.drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import Refused
 
 # Bootstrap registers every GigE Vision camera has (GigE Vision 1.2, section 28), whatever its features are called.
 VENDOR, MODEL, VERSION, SERIAL = (0x0048, 32), (0x0068, 32), (0x0088, 32), (0x00D8, 16)

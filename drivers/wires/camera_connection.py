@@ -11,9 +11,9 @@ import threading
 from collections import Counter
 from dataclasses import dataclass
 
-from drivers.framing.aravis_library import AravisError
-from drivers.settings import Identity, same_device
-from drivers.wires.aravis import (
+from thermostand.drivers.framing.aravis_library import AravisError
+from thermostand.drivers.settings import Identity, same_device
+from thermostand.drivers.wires.aravis import (
     BUFFER_STATUS,
     BUFFER_SUCCESS,
     G_TYPE_DOUBLE,
@@ -24,7 +24,7 @@ from drivers.wires.aravis import (
     GigeStream,
     Pixels,
 )
-from drivers.wires.camera_apply import (
+from thermostand.drivers.wires.camera_apply import (
     TICK_FREQUENCY_HIGH,
     TICK_FREQUENCY_LOW,
     apply_settings,
@@ -32,13 +32,18 @@ from drivers.wires.camera_apply import (
     set_exposure,
     software_trigger,
 )
-from drivers.wires.camera_errors import NO_CONTROL_HINT
-from drivers.wires.camera_settings import AravisCameraSettings, GigeCameraSettings, TemperatureFeature
-from drivers.wires.camera_temperature import NoTemperature, find_temperature, read_temperature, temperature_place
-from drivers.wires.frame_count import FrameCount
-from foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
-from foundation.errors import Refused
-from foundation.readings import Cause
+from thermostand.drivers.wires.camera_errors import NO_CONTROL_HINT
+from thermostand.drivers.wires.camera_settings import AravisCameraSettings, GigeCameraSettings, TemperatureFeature
+from thermostand.drivers.wires.camera_temperature import (
+    NoTemperature,
+    find_temperature,
+    read_temperature,
+    temperature_place,
+)
+from thermostand.drivers.wires.frame_count import FrameCount
+from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
+from thermostand.foundation.errors import Refused
+from thermostand.foundation.readings import Cause
 
 # Aravis' stream: ask again for a missing packet after 1 ms, then every 40 ms, for as much of a frame as was lost.
 INITIAL_PACKET_TIMEOUT_US = 1_000

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
-from foundation.errors import DeviceError, Refused, Unreachable
+from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
+from thermostand.foundation.errors import DeviceError, Refused, Unreachable
 
 # Codes of arv-device-error-quark.
 SILENT = {2, 4, 5, 6}  # not connected, transfer error, timeout, device not found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from foundation.clock import NS_PER_S
+from thermostand.foundation.clock import NS_PER_S
 
 # IEEE 802.3 around each IP packet: preamble 8, header 14, check sequence 4 and gap 12 bytes.
 ETHERNET_BYTES = 38

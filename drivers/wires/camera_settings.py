@@ -8,9 +8,9 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import Field, model_validator
 
-from drivers.settings import CameraSettings
-from foundation.addresses import IpAddress
-from foundation.documents import Document
+from thermostand.drivers.settings import CameraSettings
+from thermostand.foundation.addresses import IpAddress
+from thermostand.foundation.documents import Document
 
 PixelFormat = Literal[
     "Mono8", "Mono10", "Mono12", "Mono16", "Mono10Packed", "Mono12Packed", "Mono10p", "Mono12p"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from drivers.framing.aravis_library import AravisError
-from drivers.wires.aravis import GigeDevice
-from drivers.wires.camera_dialects import TEMPERATURE_ENTRIES, TEMPERATURES
-from drivers.wires.camera_errors import is_silence
-from drivers.wires.camera_settings import TemperatureFeature
-from foundation.readings import Cause
+from thermostand.drivers.framing.aravis_library import AravisError
+from thermostand.drivers.wires.aravis import GigeDevice
+from thermostand.drivers.wires.camera_dialects import TEMPERATURE_ENTRIES, TEMPERATURES
+from thermostand.drivers.wires.camera_errors import is_silence
+from thermostand.drivers.wires.camera_settings import TemperatureFeature
+from thermostand.foundation.readings import Cause
 
 VERSION = 0x0000  # the bootstrap register that each camera has (GigE Vision 1.2, section 28)
 

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from drivers.wires.link import CLOSING_S, ByteLink, HangUps, SerialSettings, open_link
-from foundation.errors import GarbledReply, Unreachable
+from thermostand.drivers.wires.link import CLOSING_S, ByteLink, HangUps, SerialSettings, open_link
+from thermostand.foundation.errors import GarbledReply, Unreachable
 
 Answer = TypeVar("Answer")
 

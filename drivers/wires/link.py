@@ -13,8 +13,8 @@ from typing import Protocol
 
 import serial
 
-from foundation.addresses import SerialPlace, place_of
-from foundation.errors import Unreachable
+from thermostand.foundation.addresses import SerialPlace, place_of
+from thermostand.foundation.errors import Unreachable
 
 _CONNECT_S = 1.0
 _WRITE_S = 1.0  # a device that takes no bytes must not hold the caller

@@ -24,11 +24,11 @@ from pymodbus.framer.rtu import FramerRTU
 from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu.register_message import WriteMultipleRegistersRequest, WriteSingleRegisterRequest
 
-from drivers.wires.link import CLOSING_S, HangUps, why_closed
-from drivers.wires.modbus_messages import READS, REPLIES, Decoder, WriteCoilWord
-from drivers.wires.registers import Space
-from foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of
-from foundation.documents import Document
+from thermostand.drivers.wires.link import CLOSING_S, HangUps, why_closed
+from thermostand.drivers.wires.modbus_messages import READS, REPLIES, Decoder, WriteCoilWord
+from thermostand.drivers.wires.registers import Space
+from thermostand.foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of
+from thermostand.foundation.documents import Document
 
 # Every fault is raised and counted here; pymodbus would print it a second time on stderr.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)

@@ -20,7 +20,7 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-from drivers.wires.registers import Space
+from thermostand.drivers.wires.registers import Space
 
 READS: dict[Space, type[ModbusPDU]] = {
     "holding": ReadHoldingRegistersRequest,

@@ -11,10 +11,19 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from drivers.settings import Identity, same_device
-from drivers.wires.bus import Bus
-from drivers.wires.registers import Command, IdentityPoint, InForceCheck, Point, PointType, RegisterMap, Space, Split
-from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
+from thermostand.drivers.settings import Identity, same_device
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.registers import (
+    Command,
+    IdentityPoint,
+    InForceCheck,
+    Point,
+    PointType,
+    RegisterMap,
+    Space,
+    Split,
+)
+from thermostand.foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 
 WRITE_TRIES = 2
 CONFIRM_LOOKS = 3  # a status bit may lag its command by a scan of the unit

@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from foundation.documents import Document, load_document
+from thermostand.foundation.documents import Document, load_document
 
 Space = Literal["holding", "input", "coil", "discrete"]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]

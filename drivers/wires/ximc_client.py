@@ -12,9 +12,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from drivers.framing.ximc import ERROR_SIZES, Damage, Frame, decode, encode
-from drivers.wires.link import ByteLink
-from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
+from thermostand.drivers.framing.ximc import ERROR_SIZES, Damage, Frame, decode, encode
+from thermostand.drivers.wires.link import ByteLink
+from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 READ_RETRIES = 2
 _MARK = b"\0"

@@ -18,15 +18,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from foundation.errors import SessionError
-from foundation.files import make_durable_folder, replace_file, sync_folder
-from foundation.json_values import json_object
-from foundation.lock_file import try_lock
-from recording.format.inventory import State, inventory
-from recording.reading.catalogue import DELETED, Entry, contents_of
-from recording.reading.journal_lines import JOURNAL_NAME
-from recording.reading.notes import NOTES_NAME, Archived, add_archived
-from recording.reading.run_word import Files, Run
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import make_durable_folder, replace_file, sync_folder
+from thermostand.foundation.json_values import json_object
+from thermostand.foundation.lock_file import try_lock
+from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.reading.catalogue import DELETED, Entry, contents_of
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.reading.notes import NOTES_NAME, Archived, add_archived
+from thermostand.recording.reading.run_word import Files, Run
 
 MANIFEST = "archive.json"
 KEEP_TAG = "keep"  # a session with this tag is never deleted

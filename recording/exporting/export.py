@@ -27,16 +27,16 @@ from pathlib import Path
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from google.protobuf.message import DecodeError
 
-from foundation.errors import SessionError
-from foundation.files import new_folder
-from recording.exporting.frames_file import frames_rows
-from recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
-from recording.exporting.tables import TABLES, Cell, Column, CsvTable, TableFormat, check_format
-from recording.exporting.telemetry_tables import TIME_COLUMNS, write_telemetry
-from recording.format.damage import FileDamaged, naming
-from recording.format.images import SIGNATURE, decode_image, encode_png
-from recording.reading.notes import read_notes
-from recording.reading.session import RecordedImage, Session
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import new_folder
+from thermostand.recording.exporting.frames_file import frames_rows
+from thermostand.recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
+from thermostand.recording.exporting.tables import TABLES, Cell, Column, CsvTable, TableFormat, check_format
+from thermostand.recording.exporting.telemetry_tables import TIME_COLUMNS, write_telemetry
+from thermostand.recording.format.damage import FileDamaged, naming
+from thermostand.recording.format.images import SIGNATURE, decode_image, encode_png
+from thermostand.recording.reading.notes import read_notes
+from thermostand.recording.reading.session import RecordedImage, Session
 
 STEP_COLUMNS = (
     *TIME_COLUMNS,

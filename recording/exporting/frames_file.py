@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from recording.exporting.sidecar import StandTemperatures
-from recording.exporting.tables import Cell, Column
-from recording.reading.session import Session
+from thermostand.recording.exporting.sidecar import StandTemperatures
+from thermostand.recording.exporting.tables import Cell, Column
+from thermostand.recording.reading.session import Session
 
 _FIRST = (
     Column("file", "text"),

@@ -13,15 +13,15 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from foundation.errors import SessionError
-from foundation.files import make_durable_folder, sync_folder
-from recording.exporting.topics import recorded_topics
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
-from recording.format.layout import DEVICES, SESSION_METADATA
-from recording.format.records import Message, telemetry_messages
-from recording.reading.notes import NOTES_NAME
-from recording.reading.session import Session
-from recording.writing.segment import Topic
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import make_durable_folder, sync_folder
+from thermostand.recording.exporting.topics import recorded_topics
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from thermostand.recording.format.layout import DEVICES, SESSION_METADATA
+from thermostand.recording.format.records import Message, telemetry_messages
+from thermostand.recording.reading.notes import NOTES_NAME
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.segment import Topic
 
 _CHUNK_BYTES = 1 << 22
 _CLASSES: dict[str, type[ProtobufMessage]] = {each.DESCRIPTOR.full_name: each for each in IMAGE_CLASS.values()}

@@ -15,22 +15,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from foundation.calls import Lane
-from foundation.clock import Clock, VirtualClock, WallClock
-from foundation.errors import SessionError
-from foundation.files import new_folder
-from foundation.hub import Hub
-from foundation.items import Item
-from foundation.readings import Frame
-from recording.exporting.topics import recorded_devices
-from recording.format.decoded_items import Description
-from recording.format.holes import holes_text
-from recording.format.images import IMAGE_CLASS, ImageEncoding
-from recording.format.records import frame_places
-from recording.reading.journal_lines import JOURNAL_NAME
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
-from recording.writing.recorder_settings import VIRTUAL_COMMIT_S
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock, VirtualClock, WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import new_folder
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item
+from thermostand.foundation.readings import Frame
+from thermostand.recording.exporting.topics import recorded_devices
+from thermostand.recording.format.decoded_items import Description
+from thermostand.recording.format.holes import holes_text
+from thermostand.recording.format.images import IMAGE_CLASS, ImageEncoding
+from thermostand.recording.format.records import frame_places
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
 
 # Items read at once, at most one frame among them: few enough to keep memory flat, enough to make the hand-over to the
 # reading thread cheap.

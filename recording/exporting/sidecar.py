@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from foundation.clock import NS_PER_S
-from foundation.instants import utc_text
-from recording.exporting.tables import Cell, Column
-from recording.exporting.topics import recorded_devices
-from recording.format import messages
-from recording.format.utc_offsets import UtcOffsets
-from recording.reading.session import RecordedImage, Session
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.instants import utc_text
+from thermostand.recording.exporting.tables import Cell, Column
+from thermostand.recording.exporting.topics import recorded_devices
+from thermostand.recording.format import messages
+from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.session import RecordedImage, Session
 
 SIDECAR_COLUMNS = (
     Column("file", "text"),

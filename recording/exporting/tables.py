@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
-from foundation.errors import SessionError
-from foundation.instants import utc_text
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.instants import utc_text
 
 TableFormat = Literal["csv", "parquet"]
 Cell = int | float | str | None

@@ -11,15 +11,15 @@ from contextlib import ExitStack
 from operator import attrgetter
 from pathlib import Path
 
-from foundation.items import Batch
-from foundation.readings import Reading
-from recording.exporting.tables import TABLES, Cell, Column, Table, TableFormat
-from recording.exporting.topics import recorded_devices
-from recording.format import messages
-from recording.format.kinds import Quantity
-from recording.format.records import Message, telemetry_messages
-from recording.format.utc_offsets import UtcOffsets
-from recording.reading.session import Session
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading
+from thermostand.recording.exporting.tables import TABLES, Cell, Column, Table, TableFormat
+from thermostand.recording.exporting.topics import recorded_devices
+from thermostand.recording.format import messages
+from thermostand.recording.format.kinds import Quantity
+from thermostand.recording.format.records import Message, telemetry_messages
+from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.session import Session
 
 TIME_COLUMNS = (Column("time_ns", "ns"), Column("time_utc", "utc"))
 META_COLUMNS = (

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from mcap.records import Channel
 
-from foundation.errors import SessionError
-from recording.format import messages
-from recording.format.damage import reading
-from recording.format.layout import DEVICES, TELEMETRY
-from recording.format.summary import read_summary
-from recording.reading.session import Session
-from recording.writing.segment import Topic
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format import messages
+from thermostand.recording.format.damage import reading
+from thermostand.recording.format.layout import DEVICES, TELEMETRY
+from thermostand.recording.format.summary import read_summary
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.segment import Topic
 
 
 def recorded_topics(session: Session) -> tuple[Topic, ...]:

@@ -14,23 +14,23 @@ from pathlib import Path
 
 from mcap.writer import CompressionType
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.errors import SessionError
-from foundation.events import TRIMMED
-from foundation.files import new_folder
-from foundation.items import StepMark, StepState
-from recording.exporting.topics import recorded_topics
-from recording.format import messages
-from recording.format.holes import holes_text
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
-from recording.format.utc_offsets import offset_event
-from recording.reading.extent import Extent, extent_of
-from recording.reading.session import Session
-from recording.writing.recorder import RecordingSettings
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import TRIMMED
+from thermostand.foundation.files import new_folder
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.recording.exporting.topics import recorded_topics
+from thermostand.recording.format import messages
+from thermostand.recording.format.holes import holes_text
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
+from thermostand.recording.format.utc_offsets import offset_event
+from thermostand.recording.reading.extent import Extent, extent_of
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import RecordingSettings
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
 
 # Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
 BLOCK_NS = 60 * NS_PER_S

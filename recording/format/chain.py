@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
-from recording.format.holes import Hole
-from recording.format.layout import SESSION_CRC, segment_metadata
+from thermostand.recording.format.holes import Hole
+from thermostand.recording.format.layout import SESSION_CRC, segment_metadata
 
 MOST_MISSING = 10_000  # segments; a night has hundreds
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import zstandard
 from mcap.exceptions import McapError
 
-from foundation.errors import SessionError
+from thermostand.foundation.errors import SessionError
 
 # CRC and Unicode errors are ValueErrors.
 DAMAGE = (

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Channel
 
-from foundation.items import Batch, Event, Original, StepMark
-from foundation.readings import Frame
-from recording.format import messages
-from recording.format.damage import naming
-from recording.format.images import decode_image
-from recording.format.records import FramePlace, Message
+from thermostand.foundation.items import Batch, Event, Original, StepMark
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format import messages
+from thermostand.recording.format.damage import naming
+from thermostand.recording.format.images import decode_image
+from thermostand.recording.format.records import FramePlace, Message
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import cast
 
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.utc_offsets import UtcOffsets
 
 _WHAT = {TELEMETRY: "without their descriptions", FRAMES: "that are described"}
 _NUMBERS = (int, type(None))

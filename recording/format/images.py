@@ -27,12 +27,12 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
-from foundation.errors import SessionError
-from foundation.image_limit import size_fault
-from foundation.readings import Frame
-from recording.format.messages import timestamp
-from recording.format.strips import KIND as STRIPS
-from recording.format.strips import compressed, index_of, strips_in
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.image_limit import size_fault
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.messages import timestamp
+from thermostand.recording.format.strips import KIND as STRIPS
+from thermostand.recording.format.strips import compressed, index_of, strips_in
 
 CAMERA_IMAGE = "/camera/image"
 

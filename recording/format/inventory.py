@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from thermostand.recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
 
 
 class State(StrEnum):

@@ -31,11 +31,11 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import Batch, Event, Original, StepMark, StepState
-from foundation.readings import Cause, Frame, Quality, Reading
-from recording.format.kinds import KIND_OF_TOPIC, KINDS, Kind
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Batch, Event, Original, StepMark, StepState
+from thermostand.foundation.readings import Cause, Frame, Quality, Reading
+from thermostand.recording.format.kinds import KIND_OF_TOPIC, KINDS, Kind
 
 CAMERA_META = "/camera/meta"
 TABLE_POSE = "/table/pose"

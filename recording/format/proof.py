@@ -12,7 +12,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Header, MessageIndex, Metadata, Schema
 
-from recording.format.mcap_bytes import (
+from thermostand.recording.format.mcap_bytes import (
     MESSAGE,
     MESSAGE_INDEX,
     MESSAGE_INDEX_ENTRY,

@@ -11,7 +11,7 @@ import zlib
 from array import array
 from functools import cache
 
-from recording.format.mcap_bytes import Source
+from thermostand.recording.format.mcap_bytes import Source
 
 _STEP_BYTES = 1 << 12
 _READ_BYTES = 1 << 20

@@ -19,11 +19,11 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
-from foundation.errors import SessionError
-from recording.format.damage import FileDamaged, reading
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
-from recording.format.layout import SALVAGE_METADATA, SEGMENT_METADATA, SESSION_METADATA, contradicts
-from recording.format.mcap_bytes import (
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.damage import FileDamaged, reading
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from thermostand.recording.format.layout import SALVAGE_METADATA, SEGMENT_METADATA, SESSION_METADATA, contradicts
+from thermostand.recording.format.mcap_bytes import (
     CHUNK_LIMIT_BYTES,
     RECORD,
     ChunkHead,
@@ -33,8 +33,8 @@ from recording.format.mcap_bytes import (
     chunk_head,
     stream,
 )
-from recording.format.messages import CLASSES
-from recording.format.summary import ChunkPlace, Summary, read_summary
+from thermostand.recording.format.messages import CLASSES
+from thermostand.recording.format.summary import ChunkPlace, Summary, read_summary
 
 _CHUNK_HEAD_BYTES = 64
 _FRAME_HEAD_BYTES = 1 << 14  # schema, channel and what precedes the image; 3 KiB in the first chunk, 90 bytes in others

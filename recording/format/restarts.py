@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from foundation.events import CAPTURE_RESTARTED
-from foundation.items import Event
+from thermostand.foundation.events import CAPTURE_RESTARTED
+from thermostand.foundation.items import Event
 
 
 def restarted(time_ns: int, step_id: str, frames: int, how: str, frames_lost: int = 0) -> Event:

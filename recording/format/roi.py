@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from foundation.clock import seconds_ns
-from foundation.readings import Frame
-from recording.format.images import ImageArray, Windows, encode_image
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.images import ImageArray, Windows, encode_image
 
 FindWindows = Callable[[ImageArray], Windows | None]
 

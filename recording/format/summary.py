@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from recording.format.mcap_bytes import CRC, RECORD, RECORD_LIMIT_BYTES, check_crc, records, stream
+from thermostand.recording.format.mcap_bytes import CRC, RECORD, RECORD_LIMIT_BYTES, check_crc, records, stream
 
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, begin of its offsets; a CRC follows
 _FOOTER_BYTES = _FOOTER.size + CRC.size + len(MCAP0_MAGIC)

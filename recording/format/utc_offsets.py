@@ -19,10 +19,10 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from foundation.clock import NS_PER_S
-from foundation.events import CLOCK_STEP
-from foundation.instants import date_time, local_text, utc_text
-from foundation.items import Event
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import CLOCK_STEP
+from thermostand.foundation.instants import date_time, local_text, utc_text
+from thermostand.foundation.items import Event
 
 REPEATED_NS = 300 * NS_PER_S  # as long as the offset is not 0
 _INT64 = (-(1 << 63), (1 << 63) - 1)

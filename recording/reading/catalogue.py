@@ -19,15 +19,15 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from foundation.errors import SessionError
-from foundation.version import installed_version
-from recording.format.inventory import is_locked
-from recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
-from recording.reading.journal_lines import JOURNAL_NAME
-from recording.reading.notes import NOTES_NAME, Archived, Note, read_notes
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.version import installed_version
+from thermostand.recording.format.inventory import is_locked
+from thermostand.recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.reading.notes import NOTES_NAME, Archived, Note, read_notes
 
 if TYPE_CHECKING:
-    from recording.reading.glance import Glance
+    from thermostand.recording.reading.glance import Glance
 
 INDEX_NAME = ".sessions.sqlite"
 DELETED = ".deleted"  # of a folder that is being deleted, behind a dot and its name
@@ -152,7 +152,7 @@ def catalogue(folder: Path, report: Callable[[int], Report] | None = None, memor
 
 def look_at(path: Path) -> Entry:
     """The session in `path`, whatever an index says; SessionError when there is none."""
-    from recording.reading.glance import glance  # takes half a second to import
+    from thermostand.recording.reading.glance import glance  # takes half a second to import
 
     return entry_of(glance(path))
 

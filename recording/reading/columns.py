@@ -16,10 +16,10 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from foundation.errors import SessionError
-from foundation.items import Batch
-from foundation.readings import Quality
-from recording.format import messages
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Quality
+from thermostand.recording.format import messages
 
 Column = tuple[NDArray[np.int64], NDArray[np.float64]]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.items import Event, StepMark
-from recording.format import messages
-from recording.format.messages import FrameMeta
-from recording.format.records import Message
+from thermostand.foundation.items import Event, StepMark
+from thermostand.recording.format import messages
+from thermostand.recording.format.messages import FrameMeta
+from thermostand.recording.format.records import Message
 
 FrameKey = tuple[int, int]  # time_ns and sequence, which an image and its description share
 

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf
 
-from foundation.clock import NS_PER_S
-from foundation.events import RUN_BEGINS, RUN_END
-from foundation.items import Event
-from recording.format.chain import Link
-from recording.format.holes import Hole
-from recording.format.inventory import SegmentFile, State
-from recording.format.layout import TELEMETRY
-from recording.reading.journal_lines import JournalFacts
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import RUN_BEGINS, RUN_END
+from thermostand.foundation.items import Event
+from thermostand.recording.format.chain import Link
+from thermostand.recording.format.holes import Hole
+from thermostand.recording.format.inventory import SegmentFile, State
+from thermostand.recording.format.layout import TELEMETRY
+from thermostand.recording.reading.journal_lines import JournalFacts
 
 # Between the middle of a frame's exposure and its description being on the disk, or the frame itself.
 TORN_NS = 5 * NS_PER_S

@@ -12,9 +12,9 @@ from __future__ import annotations
 import zstandard
 from mcap.opcode import Opcode
 
-from recording.format.mcap_bytes import CRC, RECORD, ChunkHead, Source
-from recording.format.proof import Claim
-from recording.format.range_crc import RangeCrcs
+from thermostand.recording.format.mcap_bytes import CRC, RECORD, ChunkHead, Source
+from thermostand.recording.format.proof import Claim
+from thermostand.recording.format.range_crc import RangeCrcs
 
 _FREE_BYTES = 1 << 24  # more than what any damage of a disk makes false in a small file
 _LIMIT_BYTES, _LIMIT_FACTOR = 1 << 28, 16

@@ -11,16 +11,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from foundation.clock import NS_PER_S
-from foundation.events import RUN_BEGINS, RUN_END, TELL_PLAN
-from foundation.items import Event, StepMark, StepState
-from recording.format.holes import Hole
-from recording.format.inventory import State
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.utc_offsets import UtcOffsets
-from recording.reading.coverage import Coverage
-from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts
-from recording.reading.run_word import last_run_event
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import RUN_BEGINS, RUN_END, TELL_PLAN
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.recording.format.holes import Hole
+from thermostand.recording.format.inventory import State
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.coverage import Coverage
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts
+from thermostand.recording.reading.run_word import last_run_event
 
 # The journal may be ahead of telemetry that waits for its next commit, on a virtual clock for 20 s.
 AHEAD_NS = 60 * NS_PER_S

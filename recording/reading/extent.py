@@ -6,9 +6,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-from foundation.json_values import json_object
-from recording.format.utc_offsets import UtcOffsets
-from recording.reading.run_word import Run, known_word
+from thermostand.foundation.json_values import json_object
+from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.run_word import Run, known_word
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.contents import FrameKey
-from recording.reading.coverage import Coverage
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.contents import FrameKey
+from thermostand.recording.reading.coverage import Coverage
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.errors import SessionError
-from foundation.items import Event, StepMark
-from recording.format.messages import FrameMeta
-from recording.format.restarts import begins_of, is_superseded
-from recording.reading.columns import Column
-from recording.reading.interpolation import Float, interpolated
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Event, StepMark
+from thermostand.recording.format.messages import FrameMeta
+from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.reading.columns import Column
+from thermostand.recording.reading.interpolation import Float, interpolated
 
 _AIR = "thermometers.air"
 

@@ -17,11 +17,11 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.clock import NS_PER_S
-from foundation.events import FRAMES_DROPPED
-from foundation.instants import duration
-from foundation.items import Event
-from recording.format.utc_offsets import UtcOffsets
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import FRAMES_DROPPED
+from thermostand.foundation.instants import duration
+from thermostand.foundation.items import Event
+from thermostand.recording.format.utc_offsets import UtcOffsets
 
 SHORTEST_NS = 5 * NS_PER_S
 MEDIANS = 3

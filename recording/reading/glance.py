@@ -11,30 +11,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import Event, StepMark
-from recording.format import messages
-from recording.format.chain import Link, misplaced, missing_segments
-from recording.format.damage import DAMAGE, reading
-from recording.format.decoded_items import event_of, step_of
-from recording.format.holes import holes_in, segments_text
-from recording.format.inventory import SegmentFile, State, inventory
-from recording.format.layout import FINISHED, FRAMES, TELEMETRY, unknown_format
-from recording.format.mcap_bytes import Source
-from recording.format.records import Head, read_head, telemetry_messages
-from recording.format.summary import Summary, read_summary
-from recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
-from recording.reading.coverage import Coverage, coverage_of
-from recording.reading.ends import is_of_a_run, lost_end
-from recording.reading.extent import extent_of
-from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
-from recording.reading.kept_originals import is_recovered
-from recording.reading.notes import NOTES_NAME, read_notes
-from recording.reading.run_word import Files, Run, run_word
-from recording.reading.session import Session
-from recording.reading.temperature_present import NO_TEMPERATURE, has_recorded_temperature
-from recording.reading.walk import survey
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Event, StepMark
+from thermostand.recording.format import messages
+from thermostand.recording.format.chain import Link, misplaced, missing_segments
+from thermostand.recording.format.damage import DAMAGE, reading
+from thermostand.recording.format.decoded_items import event_of, step_of
+from thermostand.recording.format.holes import holes_in, segments_text
+from thermostand.recording.format.inventory import SegmentFile, State, inventory
+from thermostand.recording.format.layout import FINISHED, FRAMES, TELEMETRY, unknown_format
+from thermostand.recording.format.mcap_bytes import Source
+from thermostand.recording.format.records import Head, read_head, telemetry_messages
+from thermostand.recording.format.summary import Summary, read_summary
+from thermostand.recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
+from thermostand.recording.reading.coverage import Coverage, coverage_of
+from thermostand.recording.reading.ends import is_of_a_run, lost_end
+from thermostand.recording.reading.extent import extent_of
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
+from thermostand.recording.reading.kept_originals import is_recovered
+from thermostand.recording.reading.notes import NOTES_NAME, read_notes
+from thermostand.recording.reading.run_word import Files, Run, run_word
+from thermostand.recording.reading.session import Session
+from thermostand.recording.reading.temperature_present import NO_TEMPERATURE, has_recorded_temperature
+from thermostand.recording.reading.walk import survey
 
 _NEAR = (messages.EVENT, messages.STEP)
 _LAST = 2  # segments of the telemetry: a run's end is recorded before its stand is safe, which may take ten minutes

@@ -8,16 +8,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from recording.format.chain import missing_segments
-from recording.format.holes import Hole
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.utc_offsets import offsets_of
-from recording.reading.contents import Contents, FrameKey
-from recording.reading.coverage import Coverage
-from recording.reading.ends import lost_end
-from recording.reading.frame_account import FrameAccount, frame_account
-from recording.reading.gaps import reported_blocks
-from recording.reading.journal_lines import JournalFacts
+from thermostand.recording.format.chain import missing_segments
+from thermostand.recording.format.holes import Hole
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.utc_offsets import offsets_of
+from thermostand.recording.reading.contents import Contents, FrameKey
+from thermostand.recording.reading.coverage import Coverage
+from thermostand.recording.reading.ends import lost_end
+from thermostand.recording.reading.frame_account import FrameAccount, frame_account
+from thermostand.recording.reading.gaps import reported_blocks
+from thermostand.recording.reading.journal_lines import JournalFacts
 
 
 def find_holes(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.clock import NS_PER_S
+from thermostand.foundation.clock import NS_PER_S
 
 Instants = NDArray[np.int64]
 Float = NDArray[np.float64]

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from foundation.json_values import json_object
+from thermostand.foundation.json_values import json_object
 
 JOURNAL_NAME = "journal.jsonl"
 LIMIT_BYTES = 32_000_000  # an entry a minute for 200 days; all of them are in memory

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from mcap.records import DataEnd, Message
 from mcap.stream_reader import StreamReader
 
-from recording.format.damage import DAMAGE
-from recording.format.inventory import SegmentFile
+from thermostand.recording.format.damage import DAMAGE
+from thermostand.recording.format.inventory import SegmentFile
 
 
 def is_recovered(kept: SegmentFile, salvage: Mapping[str, str], recovered: int) -> bool:

@@ -13,8 +13,8 @@ from itertools import accumulate, pairwise
 from math import inf
 from typing import NamedTuple
 
-from foundation.clock import NS_PER_S
-from recording.format.mcap_bytes import ChunkHead
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.recording.format.mcap_bytes import ChunkHead
 
 SECTOR_BYTES = 4096  # the largest of today's disks
 APART_NS = 10 * NS_PER_S

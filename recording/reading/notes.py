@@ -17,9 +17,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import cast
 
-from foundation.errors import ConfigError, SessionError
-from foundation.json_values import json_object
-from recording.reading.journal_lines import damage_text, journal_lines, lines_of, mark_of, unended_text
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.json_values import json_object
+from thermostand.recording.reading.journal_lines import damage_text, journal_lines, lines_of, mark_of, unended_text
 
 NOTES_NAME = "notes.jsonl"
 LONGEST_NOTE = 4000  # characters

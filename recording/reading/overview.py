@@ -11,18 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from foundation.errors import SessionError
-from foundation.events import RUN_END, TELL_PLAN
-from foundation.items import Event, StepMark, StepState
-from recording.format.images import decode_image
-from recording.format.inventory import SegmentFile, State
-from recording.format.layout import FRAMES
-from recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
-from recording.format.utc_offsets import UtcOffsets, offsets_of
-from recording.reading.contents import Channel, Contents
-from recording.reading.gaps import Silence, reported_blocks, silences
-from recording.reading.glance import Glance, glance, within
-from recording.reading.run_word import Files
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import RUN_END, TELL_PLAN
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.recording.format.images import decode_image
+from thermostand.recording.format.inventory import SegmentFile, State
+from thermostand.recording.format.layout import FRAMES
+from thermostand.recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
+from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
+from thermostand.recording.reading.contents import Channel, Contents
+from thermostand.recording.reading.gaps import Silence, reported_blocks, silences
+from thermostand.recording.reading.glance import Glance, glance, within
+from thermostand.recording.reading.run_word import Files
 
 
 @dataclass(frozen=True, slots=True)

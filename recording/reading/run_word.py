@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from enum import StrEnum
 
-from foundation.events import RUN_BEGINS, RUN_END
-from foundation.items import Event
-from recording.reading.journal_lines import JournalFacts
+from thermostand.foundation.events import RUN_BEGINS, RUN_END
+from thermostand.foundation.items import Event
+from thermostand.recording.reading.journal_lines import JournalFacts
 
 
 class Run(StrEnum):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
 
 _NUMBER_DIGITS = 18
 

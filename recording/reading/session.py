@@ -20,13 +20,13 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from foundation.errors import NotThere, SessionError
-from foundation.items import Event, Item, Original, StepMark
-from foundation.readings import Frame
-from recording.format import messages
-from recording.format.chain import Link, misplaced
-from recording.format.damage import FileDamaged, naming
-from recording.format.decoded_items import (
+from thermostand.foundation.errors import NotThere, SessionError
+from thermostand.foundation.items import Event, Item, Original, StepMark
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format import messages
+from thermostand.recording.format.chain import Link, misplaced
+from thermostand.recording.format.damage import FileDamaged, naming
+from thermostand.recording.format.decoded_items import (
     Description,
     ImagesToCome,
     RecordedImage,
@@ -38,10 +38,18 @@ from recording.format.decoded_items import (
     stands_for_item,
     step_of,
 )
-from recording.format.holes import Hole, holes_in
-from recording.format.inventory import State, inventory
-from recording.format.layout import DAMAGED, DEVICES, FINISHED, FRAMES, TELEMETRY, UNFINISHED, unknown_format
-from recording.format.records import (
+from thermostand.recording.format.holes import Hole, holes_in
+from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.format.layout import (
+    DAMAGED,
+    DEVICES,
+    FINISHED,
+    FRAMES,
+    TELEMETRY,
+    UNFINISHED,
+    unknown_format,
+)
+from thermostand.recording.format.records import (
     FramePlace,
     Message,
     MessageSpan,
@@ -51,16 +59,16 @@ from recording.format.records import (
     read_head,
     telemetry_messages,
 )
-from recording.format.utc_offsets import UtcOffsets, offsets_of
-from recording.reading.columns import Column, TopicColumns
-from recording.reading.contents import Contents
-from recording.reading.coverage import coverage_of
-from recording.reading.extent import extent_of
-from recording.reading.frames_table import FramesTable, frames_table
-from recording.reading.hole_finder import find_holes
-from recording.reading.journal_lines import journal_facts
-from recording.reading.run_word import Run, run_word
-from recording.reading.segment_files import number_of, segments_in, segments_of
+from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
+from thermostand.recording.reading.columns import Column, TopicColumns
+from thermostand.recording.reading.contents import Contents
+from thermostand.recording.reading.coverage import coverage_of
+from thermostand.recording.reading.extent import extent_of
+from thermostand.recording.reading.frames_table import FramesTable, frames_table
+from thermostand.recording.reading.hole_finder import find_holes
+from thermostand.recording.reading.journal_lines import journal_facts
+from thermostand.recording.reading.run_word import Run, run_word
+from thermostand.recording.reading.segment_files import number_of, segments_in, segments_of
 
 T = TypeVar("T")
 _TOPICS_OF_HOLES = (messages.CAMERA_META, messages.EVENT, messages.STEP)

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from foundation.errors import SessionError
-from recording.format.messages import CAMERA_META, FrameMeta, decode_frame_meta
-from recording.format.records import telemetry_messages
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.messages import CAMERA_META, FrameMeta, decode_frame_meta
+from thermostand.recording.format.records import telemetry_messages
 
 NO_TEMPERATURE = "no frame has a good camera temperature"
 

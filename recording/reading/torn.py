@@ -12,8 +12,8 @@ from collections import Counter
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from recording.format.mcap_bytes import MESSAGE_INDEX, MESSAGE_INDEX_ENTRY, RECORD, Source
-from recording.format.proof import OPCODES, Claim, claim_of
+from thermostand.recording.format.mcap_bytes import MESSAGE_INDEX, MESSAGE_INDEX_ENTRY, RECORD, Source
+from thermostand.recording.format.proof import OPCODES, Claim, claim_of
 
 FIRST_BLOCK_BYTES = 1 << 14  # more than an opening, or a second's telemetry with its schemas, usually is
 _WINDOW_BYTES = 4 << 20

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from foundation.errors import SessionError
-from recording.format.inventory import State, inventory
-from recording.reading.ends import frames_of_plan
-from recording.reading.run_word import Run
-from recording.reading.session import Session
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.reading.ends import frames_of_plan
+from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.session import Session
 
 _MOST = 6  # holes in a sentence before the rest is only counted
 Say = Callable[[str], None]

@@ -22,9 +22,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from recording.format.damage import DAMAGE
-from recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
-from recording.format.mcap_bytes import (
+from thermostand.recording.format.damage import DAMAGE
+from thermostand.recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
+from thermostand.recording.format.mcap_bytes import (
     MESSAGE,
     RECORD,
     ChunkHead,
@@ -34,11 +34,11 @@ from recording.format.mcap_bytes import (
     records,
     stream,
 )
-from recording.format.proof import Contents, claim_of, proven
-from recording.format.summary import read_summary
-from recording.reading.doubt import Doubt
-from recording.reading.misplaced import PlacedChunk, Span, find_misplaced_chunks
-from recording.reading.torn import Blocks
+from thermostand.recording.format.proof import Contents, claim_of, proven
+from thermostand.recording.format.summary import read_summary
+from thermostand.recording.reading.doubt import Doubt
+from thermostand.recording.reading.misplaced import PlacedChunk, Span, find_misplaced_chunks
+from thermostand.recording.reading.torn import Blocks
 
 WINDOW_BYTES = 4 << 20
 

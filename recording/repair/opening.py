@@ -20,9 +20,9 @@ from pathlib import Path
 
 from mcap.records import Attachment, Channel, Schema
 
-from recording.format.layout import FINISHED, FRAMES, TELEMETRY
-from recording.format.mcap_bytes import Source
-from recording.reading.walk import Survey, survey
+from thermostand.recording.format.layout import FINISHED, FRAMES, TELEMETRY
+from thermostand.recording.format.mcap_bytes import Source
+from thermostand.recording.reading.walk import Survey, survey
 
 SIBLINGS_PER_SERIES = 4  # enough for a vote, few enough for a night of hundreds
 SESSION_ID = "session_id"

@@ -23,9 +23,9 @@ from typing import BinaryIO
 from mcap.records import Channel
 from mcap.writer import CompressionType, Writer
 
-from foundation.errors import SessionError
-from foundation.files import sync_folder
-from recording.format.layout import (
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import sync_folder
+from thermostand.recording.format.layout import (
     DAMAGED,
     FINISHED,
     FRAMES,
@@ -37,13 +37,13 @@ from recording.format.layout import (
     UNFINISHED,
     segment_metadata,
 )
-from recording.format.mcap_bytes import Source
-from recording.reading.walk import StoredMessage, Survey, stored_messages, survey
-from recording.repair.opening import Opening, opening_of, segments_of
-from recording.repair.segment_check import check_segment
-from recording.repair.share_done import ReportShare, ShareDone, no_report
-from recording.writing.locks import lock
-from recording.writing.segment import CHUNK_BYTES
+from thermostand.recording.format.mcap_bytes import Source
+from thermostand.recording.reading.walk import StoredMessage, Survey, stored_messages, survey
+from thermostand.recording.repair.opening import Opening, opening_of, segments_of
+from thermostand.recording.repair.segment_check import check_segment
+from thermostand.recording.repair.share_done import ReportShare, ShareDone, no_report
+from thermostand.recording.writing.locks import lock
+from thermostand.recording.writing.segment import CHUNK_BYTES
 
 BEING_RECORDED = "is being recorded"
 COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}

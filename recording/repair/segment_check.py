@@ -33,9 +33,9 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from recording.format.damage import DAMAGE
-from recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
-from recording.format.mcap_bytes import (
+from thermostand.recording.format.damage import DAMAGE
+from thermostand.recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
+from thermostand.recording.format.mcap_bytes import (
     CHUNK,
     CRC,
     LENGTH,
@@ -48,8 +48,8 @@ from recording.format.mcap_bytes import (
     records,
     stream,
 )
-from recording.format.records import Message
-from recording.format.summary import Summary, read_summary
+from thermostand.recording.format.records import Message
+from thermostand.recording.format.summary import Summary, read_summary
 
 _DATA_END_BYTES = RECORD.size + CRC.size
 _PART_LIMIT_BYTES = RECORD_LIMIT_BYTES + (1 << 24)  # the indexes of its messages stand behind a chunk

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 
-from foundation.errors import SessionError
-from foundation.events import FRAMES_DROPPED
-from recording.format.chain import MOST_MISSING, Link, foreign_numbers, misplaced, missing_segments
-from recording.format.holes import Hole, holes_in, segments_text
-from recording.format.images import CAMERA_IMAGE
-from recording.format.inventory import SegmentFile, State, inventory
-from recording.format.layout import (
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import FRAMES_DROPPED
+from thermostand.recording.format.chain import MOST_MISSING, Link, foreign_numbers, misplaced, missing_segments
+from thermostand.recording.format.holes import Hole, holes_in, segments_text
+from thermostand.recording.format.images import CAMERA_IMAGE
+from thermostand.recording.format.inventory import SegmentFile, State, inventory
+from thermostand.recording.format.layout import (
     FINISHED,
     FRAMES,
     SALVAGE_METADATA,
@@ -28,22 +28,22 @@ from recording.format.layout import (
     TELEMETRY,
     unknown_format,
 )
-from recording.format.records import Message
-from recording.format.utc_offsets import UtcOffsets, offsets_of
-from recording.reading.contents import Contents, FrameKey
-from recording.reading.coverage import Coverage, coverage_of
-from recording.reading.ends import is_of_a_run, lost_end
-from recording.reading.extent import Extent, extent_of
-from recording.reading.frame_account import frame_account
-from recording.reading.gaps import reported_blocks, silences
-from recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
-from recording.reading.kept_originals import is_recovered
-from recording.reading.notes import NOTES_NAME, Notes, read_notes
-from recording.reading.run_word import Files, Run, run_word
-from recording.reading.temperature_present import NO_TEMPERATURE, has_temperature
-from recording.repair.segment_check import Damage, SegmentCheck, check_segment
-from recording.repair.share_done import no_report
-from recording.writing.recorder_settings import SessionInfo
+from thermostand.recording.format.records import Message
+from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
+from thermostand.recording.reading.contents import Contents, FrameKey
+from thermostand.recording.reading.coverage import Coverage, coverage_of
+from thermostand.recording.reading.ends import is_of_a_run, lost_end
+from thermostand.recording.reading.extent import Extent, extent_of
+from thermostand.recording.reading.frame_account import frame_account
+from thermostand.recording.reading.gaps import reported_blocks, silences
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
+from thermostand.recording.reading.kept_originals import is_recovered
+from thermostand.recording.reading.notes import NOTES_NAME, Notes, read_notes
+from thermostand.recording.reading.run_word import Files, Run, run_word
+from thermostand.recording.reading.temperature_present import NO_TEMPERATURE, has_temperature
+from thermostand.recording.repair.segment_check import Damage, SegmentCheck, check_segment
+from thermostand.recording.repair.share_done import no_report
+from thermostand.recording.writing.recorder_settings import SessionInfo
 
 
 class Severity(StrEnum):

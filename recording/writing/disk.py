@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from foundation.calls import Lane
-from foundation.clock import Clock
-from foundation.errors import SessionError
-from foundation.helper import Helper
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.helper import Helper
 
-MODULE = "recording.writing.disk"
+MODULE = "thermostand.recording.writing.disk"
 LEFT_NAME = "stand-disk-left"  # of a process whose daemon has gone
 FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE = "frames", "telemetry", "journal", "files"
 QUEUE_LINE = "queue"  # which another program may have locked

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from mcap.writer import CompressionType
 
-from foundation.clock import seconds_ns
-from recording.format import messages
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.writing.recorder_settings import RecordingSettings
-from recording.writing.segment import SeriesForm, Topic
+from thermostand.foundation.clock import seconds_ns
+from thermostand.recording.format import messages
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.writing.recorder_settings import RecordingSettings
+from thermostand.recording.writing.segment import SeriesForm, Topic
 
 TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it continues when frames or others fill the disk
 

@@ -12,20 +12,20 @@ from enum import Enum
 
 import cv2  # noqa: F401  # pyright: ignore[reportUnusedImport] - here, so that no frame waits for it
 
-from foundation.calls import Lane
-from foundation.clock import Clock
-from foundation.items import Event, Item
-from foundation.readings import Frame
-from recording.format.images import CAMERA_IMAGE, encode_image
-from recording.format.layout import FRAMES, SEQUENCE_MASK
-from recording.format.restarts import restarted_step
-from recording.writing.home import FolderLost
-from recording.writing.homes import Homes, Kept
-from recording.writing.notices import Losses
-from recording.writing.recorder_settings import RecordingSettings
-from recording.writing.segment import Record
-from recording.writing.series import DiskSeries
-from recording.writing.waiting import Waiting
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.images import CAMERA_IMAGE, encode_image
+from thermostand.recording.format.layout import FRAMES, SEQUENCE_MASK
+from thermostand.recording.format.restarts import restarted_step
+from thermostand.recording.writing.home import FolderLost
+from thermostand.recording.writing.homes import Homes, Kept
+from thermostand.recording.writing.notices import Losses
+from thermostand.recording.writing.recorder_settings import RecordingSettings
+from thermostand.recording.writing.segment import Record
+from thermostand.recording.writing.series import DiskSeries
+from thermostand.recording.writing.waiting import Waiting
 
 _OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
 

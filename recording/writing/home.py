@@ -7,7 +7,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from foundation.files import make_durable_folder, sync_folder
+from thermostand.foundation.files import make_durable_folder, sync_folder
 
 
 class FolderLost(OSError):

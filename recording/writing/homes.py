@@ -7,10 +7,10 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from foundation.events import FOLDER_BACK, FOLDER_LOST, FOLDER_NOT_MADE, RECORDING_LOST
-from foundation.items import Event
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.writing.home import FolderLost
+from thermostand.foundation.events import FOLDER_BACK, FOLDER_LOST, FOLDER_NOT_MADE, RECORDING_LOST
+from thermostand.foundation.items import Event
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.writing.home import FolderLost
 
 Refound = Callable[[], Awaitable[bool]]
 

@@ -11,7 +11,7 @@ import os
 import time
 from pathlib import Path
 
-from recording.writing.disk import MODULE
+from thermostand.recording.writing.disk import MODULE
 
 _LEFT_WITHIN_S = 2.0
 _AGAIN_S = 0.02

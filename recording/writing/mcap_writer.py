@@ -34,7 +34,7 @@ from mcap.records import (
 )
 from mcap.writer import LIBRARY_IDENTIFIER, MCAP0_MAGIC, CompressionType
 
-from recording.format.mcap_bytes import CHUNK, CRC, LENGTH, MESSAGE, RECORD, bytes_of
+from thermostand.recording.format.mcap_bytes import CHUNK, CRC, LENGTH, MESSAGE, RECORD, bytes_of
 
 _MESSAGE = int(Opcode.MESSAGE)
 _MESSAGE_HEAD = Struct("<BQHIQQ")  # as RECORD and MESSAGE

@@ -11,7 +11,7 @@ from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
 
-from foundation.events import (
+from thermostand.foundation.events import (
     DISK_NEARLY_FULL,
     FRAMES_DROPPED,
     FRAMES_RESUMED,
@@ -19,8 +19,8 @@ from foundation.events import (
     READINGS_DROPPED,
     READINGS_LOST,
 )
-from foundation.items import Batch, Event
-from foundation.readings import Frame
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Frame
 
 
 class Space(NamedTuple):

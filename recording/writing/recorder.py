@@ -18,23 +18,23 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from foundation.calls import Lane
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import SessionError
-from foundation.events import SEGMENT_GIVEN_UP, EventKind
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.patience import Patience
-from foundation.readings import Frame
-from recording.format.decoded_items import Description
-from recording.writing.disk import Disk
-from recording.writing.forms import SessionForm
-from recording.writing.frames import Frames
-from recording.writing.homes import Beside, Homes
-from recording.writing.recorder_settings import USUAL, RecordingSettings, SessionInfo
-from recording.writing.series import DiskSeries, open_series
-from recording.writing.telemetry import Telemetry
-from recording.writing.waiting import Waiting
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import SEGMENT_GIVEN_UP, EventKind
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.decoded_items import Description
+from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.forms import SessionForm
+from thermostand.recording.writing.frames import Frames
+from thermostand.recording.writing.homes import Beside, Homes
+from thermostand.recording.writing.recorder_settings import USUAL, RecordingSettings, SessionInfo
+from thermostand.recording.writing.series import DiskSeries, open_series
+from thermostand.recording.writing.telemetry import Telemetry
+from thermostand.recording.writing.waiting import Waiting
 
 FINISH_WITHIN_S, COMPLETE_WITHIN_S = 2.0, 60.0  # real seconds that a disk may take for the end of a run: stopped, whole
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self
 
-from recording.format.images import ImageEncoding
-from recording.format.layout import FORMAT
+from thermostand.recording.format.images import ImageEncoding
+from thermostand.recording.format.layout import FORMAT
 
 _NOT_EMPTY = ("extent", "holes")  # left out of the record when they are
 

@@ -30,9 +30,9 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC, CompressionType
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from foundation.files import sync_folder
-from recording.format.damage import DAMAGE
-from recording.format.layout import (
+from thermostand.foundation.files import sync_folder
+from thermostand.recording.format.damage import DAMAGE
+from thermostand.recording.format.layout import (
     DEVICES,
     FINISHED,
     SEGMENT_METADATA,
@@ -41,9 +41,9 @@ from recording.format.layout import (
     UNFINISHED,
     segment_metadata,
 )
-from recording.format.mcap_bytes import MESSAGE, RECORD, check_attachment, chunk_content, records, stream
-from recording.writing.mcap_writer import McapWriter
-from recording.writing.notices import disk_space
+from thermostand.recording.format.mcap_bytes import MESSAGE, RECORD, check_attachment, chunk_content, records, stream
+from thermostand.recording.writing.mcap_writer import McapWriter
+from thermostand.recording.writing.notices import disk_space
 
 MANY_CHUNKS = 32  # opening a chunk takes a reader as long as a dozen messages
 FILE_SYSTEM_BYTES = 1_000_000  # never reserved: the file system needs blocks of its own to hold a reserve

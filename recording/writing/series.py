@@ -11,15 +11,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from foundation.files import make_durable_folder, sync_folder
-from foundation.items import Event
-from recording.format.chain import foreign_numbers
-from recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
-from recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
-from recording.writing.forms import SessionForm
-from recording.writing.home import Home
-from recording.writing.notices import SpaceWatch
-from recording.writing.segment import CommitSink, Record, Segment, SeriesForm
+from thermostand.foundation.files import make_durable_folder, sync_folder
+from thermostand.foundation.items import Event
+from thermostand.recording.format.chain import foreign_numbers
+from thermostand.recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
+from thermostand.recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
+from thermostand.recording.writing.forms import SessionForm
+from thermostand.recording.writing.home import Home
+from thermostand.recording.writing.notices import SpaceWatch
+from thermostand.recording.writing.segment import CommitSink, Record, Segment, SeriesForm
 
 Item = TypeVar("Item")
 

@@ -14,22 +14,22 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import Message
 
-from foundation.calls import Lane
-from foundation.clock import Clock
-from foundation.errors import SessionError
-from foundation.events import TELEMETRY_NOT_SAVED, TELEMETRY_SAVED_AGAIN
-from foundation.items import Batch, Event, Item, Original, StepMark
-from foundation.readings import Frame, Quality, Reading
-from recording.format import messages
-from recording.format.decoded_items import Description, UndescribedFrame
-from recording.format.kinds import KINDS, Kind
-from recording.format.layout import SEQUENCE_MASK, TELEMETRY
-from recording.writing.homes import Homes, Kept
-from recording.writing.notices import DroppedReadings
-from recording.writing.recorder_settings import RecordingSettings
-from recording.writing.segment import Record
-from recording.writing.series import DiskSeries
-from recording.writing.waiting import Waiting
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import TELEMETRY_NOT_SAVED, TELEMETRY_SAVED_AGAIN
+from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
+from thermostand.foundation.readings import Frame, Quality, Reading
+from thermostand.recording.format import messages
+from thermostand.recording.format.decoded_items import Description, UndescribedFrame
+from thermostand.recording.format.kinds import KINDS, Kind
+from thermostand.recording.format.layout import SEQUENCE_MASK, TELEMETRY
+from thermostand.recording.writing.homes import Homes, Kept
+from thermostand.recording.writing.notices import DroppedReadings
+from thermostand.recording.writing.recorder_settings import RecordingSettings
+from thermostand.recording.writing.segment import Record
+from thermostand.recording.writing.series import DiskSeries
+from thermostand.recording.writing.waiting import Waiting
 
 NO_IMAGE = np.empty((0, 0), np.uint8)
 PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second

@@ -8,18 +8,18 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from drivers.devices.chambers.climate_chamber import ClimateChamber
-from drivers.devices.protocols import Controller, Switches
-from drivers.devices.regulators.software_regulator import SoftwareRegulator
-from foundation.clock import Clock, boot_of, seconds_ns
-from foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied
-from foundation.events import NO_DEAD_MAN, REGULATOR_OCCUPIED
-from foundation.hub import Hub
-from stand.chamber.compressor import restored
-from stand.chamber.compressor_file import CompressorFile
-from stand.chamber.keeper import Keeper
-from stand.chamber.permits import PermitLimits, Permits
-from stand.interlock import Interlock
+from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamber
+from thermostand.drivers.devices.protocols import Controller, Switches
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
+from thermostand.foundation.clock import Clock, boot_of, seconds_ns
+from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied
+from thermostand.foundation.events import NO_DEAD_MAN, REGULATOR_OCCUPIED
+from thermostand.foundation.hub import Hub
+from thermostand.stand.chamber.compressor import restored
+from thermostand.stand.chamber.compressor_file import CompressorFile
+from thermostand.stand.chamber.keeper import Keeper
+from thermostand.stand.chamber.permits import PermitLimits, Permits
+from thermostand.stand.interlock import Interlock
 
 _OCCUPIED_AGAIN_S = 5.0
 _STEP_K = 0.5  # of a set-point that is brought to its place no faster than the cameras may follow

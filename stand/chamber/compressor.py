@@ -22,10 +22,10 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from foundation.clock import Boot, seconds_ns
-from foundation.files import make_durable_folder, sync_folder
-from foundation.sealed import seal, unseal
-from stand.config.stand_config import CompressorConfig
+from thermostand.foundation.clock import Boot, seconds_ns
+from thermostand.foundation.files import make_durable_folder, sync_folder
+from thermostand.foundation.sealed import seal, unseal
+from thermostand.stand.config.stand_config import CompressorConfig
 
 _KIND = "compressor"
 # Calls of `keep`, and of which of them the file at a path is.

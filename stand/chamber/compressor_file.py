@@ -6,12 +6,12 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-from foundation.calls import Lane
-from foundation.clock import Clock, boot_of
-from foundation.events import COMPRESSOR_NOT_KEPT
-from foundation.hub import Hub
-from foundation.patience import Patience
-from stand.chamber.compressor import CompressorState, keep
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock, boot_of
+from thermostand.foundation.events import COMPRESSOR_NOT_KEPT
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.patience import Patience
+from thermostand.stand.chamber.compressor import CompressorState, keep
 
 _CLOSE_LIMIT_S = 1.0  # real seconds for the last state; a disk that hangs does not keep a daemon alive
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from drivers.devices.protocols import Controller
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError
-from foundation.events import PERMIT_NOT_RENEWED, SWITCHED_OFF
-from foundation.hub import Hub
-from stand.chamber.permits import Permission, Permits
-from stand.fault import value_of
+from thermostand.drivers.devices.protocols import Controller
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError
+from thermostand.foundation.events import PERMIT_NOT_RENEWED, SWITCHED_OFF
+from thermostand.foundation.hub import Hub
+from thermostand.stand.chamber.permits import Permission, Permits
+from thermostand.stand.fault import value_of
 
 SUPERVISED_S = 2.5  # between looks at relays and regulator while nothing is permitted: off again within 5 s
 

@@ -13,11 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from drivers.devices.protocols import Switches
-from drivers.devices.relays import HEAT
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.errors import DeviceError, DeviceFault
-from foundation.events import (
+from thermostand.drivers.devices.protocols import Switches
+from thermostand.drivers.devices.relays import HEAT
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError, DeviceFault
+from thermostand.foundation.events import (
     COMPRESSOR_DROPPED,
     COMPRESSOR_NOT_ON,
     COMPRESSOR_SWITCHED,
@@ -29,9 +29,9 @@ from foundation.events import (
     SWITCHED_OFF,
     EventKind,
 )
-from foundation.hub import Hub
-from stand.chamber.compressor import CompressorState, decide
-from stand.config.stand_config import CompressorConfig
+from thermostand.foundation.hub import Hub
+from thermostand.stand.chamber.compressor import CompressorState, decide
+from thermostand.stand.config.stand_config import CompressorConfig
 
 HEATER, COMPRESSOR = "heater_enable", "compressor"
 WATCHED = (HEATER, COMPRESSOR, HEAT)  # must be off without permission

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from foundation.command_app import App
-from foundation.errors import ConfigError, StandError
-from foundation.output import show
-from foundation.usage import one_line
-from stand.commands.reached import ConfigOption
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, StandError
+from thermostand.foundation.output import show
+from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.reached import ConfigOption
 
 app = App(no_args_is_help=True)
 _LIMIT_S = 20.0
@@ -28,10 +28,10 @@ def try_them(config: ConfigOption = "simulated") -> None:
 
     Example: stand alert test --config my-stand.yaml
     """
-    from stand.config.alerts_section import load_secrets
-    from stand.config.stand_config import load_config, packaged
-    from stand.serving.alerts import check_alerts
-    from stand.serving.alerts_process import deliver, ping
+    from thermostand.stand.config.alerts_section import load_secrets
+    from thermostand.stand.config.stand_config import load_config, packaged
+    from thermostand.stand.serving.alerts import check_alerts
+    from thermostand.stand.serving.alerts_process import deliver, ping
 
     stand = load_config(packaged("", config))
     if stand.alerts.secrets is None:

@@ -10,20 +10,20 @@ from typing import Annotated
 
 import typer
 
-from foundation.clock import WallClock
-from foundation.command_app import App
-from foundation.documents import read_document
-from foundation.errors import ConfigError
-from foundation.exit_codes import FAILED
-from foundation.output import output, show
-from foundation.usage import one_line
-from stand.commands.reached import ConfigOption
-from stand.commissioning.commissioning import commission
-from stand.commissioning.finding import Finding, worst
-from stand.commissioning.genicam_rehearsal import rehearse
-from stand.commissioning.record import Record
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.order import register_texts
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.command_app import App
+from thermostand.foundation.documents import read_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.exit_codes import FAILED
+from thermostand.foundation.output import output, show
+from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.reached import ConfigOption
+from thermostand.stand.commissioning.commissioning import commission
+from thermostand.stand.commissioning.finding import Finding, worst
+from thermostand.stand.commissioning.genicam_rehearsal import rehearse
+from thermostand.stand.commissioning.record import Record
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.running.order import register_texts
 
 app = App()
 
@@ -108,6 +108,6 @@ def _summary(findings: tuple[Finding, ...], kept: str, *, moves: bool) -> str:
 def _is_installed(path: Path) -> bool:
     """Whether it belongs to the program, whose folder is no place for records."""
     try:
-        return path.resolve().is_relative_to(Path(str(importlib.resources.files("configs"))).resolve())
+        return path.resolve().is_relative_to(Path(str(importlib.resources.files("thermostand.configs"))).resolve())
     except OSError as error:
         raise ConfigError(f"{path}: cannot be looked up ({error.strerror})") from error

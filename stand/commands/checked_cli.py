@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from foundation.documents import read_document
-from foundation.output import say
-from stand.config.checked import Checked, doubt
-from stand.config.stand_config import StandConfig
-from stand.running.order import register_texts
+from thermostand.foundation.documents import read_document
+from thermostand.foundation.output import say
+from thermostand.stand.config.checked import Checked, doubt
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.order import register_texts
 
 
 def warn_unchecked(path: Path, stand: StandConfig, record: Checked | None) -> None:

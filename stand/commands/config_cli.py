@@ -9,14 +9,14 @@ from typing import Annotated
 import typer
 from pydantic import BaseModel
 
-from drivers.camera_preset import CameraPreset
-from drivers.wires.registers import RegisterMap
-from foundation.command_app import App
-from foundation.output import show
-from foundation.schemas import write_schemas
-from markers.target import Target
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
+from thermostand.drivers.camera_preset import CameraPreset
+from thermostand.drivers.wires.registers import RegisterMap
+from thermostand.foundation.command_app import App
+from thermostand.foundation.output import show
+from thermostand.foundation.schemas import write_schemas
+from thermostand.markers.target import Target
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, packaged
 
 app = App(
     no_args_is_help=True,

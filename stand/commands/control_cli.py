@@ -14,19 +14,26 @@ from typing import Annotated, cast
 
 import typer
 
-from foundation.clock import NS_PER_S
-from foundation.command_app import App
-from foundation.errors import ConfigError, SessionError
-from foundation.instants import duration, local_text
-from foundation.output import output, show
-from foundation.usage import one_line
-from stand.commands.reached import ConfigOption, DirectoryArgument, TokenOption, UrlOption, on_stand, reached
-from stand.commands.sessions.session_text import size
-from stand.gate import ENDINGS, HELD, INTERLOCK, OPERATOR, STOPPING
-from stand.serving.client import API, Answer, Server
-from stand.serving.desk import FaultState, RunStatus, StandState
-from stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
-from stand.watching.remedies import next_command
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.instants import duration, local_text
+from thermostand.foundation.output import output, show
+from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.reached import (
+    ConfigOption,
+    DirectoryArgument,
+    TokenOption,
+    UrlOption,
+    on_stand,
+    reached,
+)
+from thermostand.stand.commands.sessions.session_text import size
+from thermostand.stand.gate import ENDINGS, HELD, INTERLOCK, OPERATOR, STOPPING
+from thermostand.stand.serving.client import API, Answer, Server
+from thermostand.stand.serving.desk import FaultState, RunStatus, StandState
+from thermostand.stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
+from thermostand.stand.watching.remedies import next_command
 
 app = App()
 
@@ -63,8 +70,8 @@ def watch(server: Server) -> None:
 
     Example: stand watch
     """
-    from stand.watching.live import view
-    from stand.watching.there import There
+    from thermostand.stand.watching.live import view
+    from thermostand.stand.watching.there import There
 
     there = There(server)
     with suppress(KeyboardInterrupt):
@@ -197,9 +204,9 @@ def _cleared_here(config: str) -> bool:
     """Whether the stand, which no program has, was latched, and is so no longer; InUse when one has it."""
     import asyncio
 
-    from stand.config.stand_config import load_config, packaged
-    from stand.running.opening.claim import claimed
-    from stand.running.opening.stand_latch import StandLatch
+    from thermostand.stand.config.stand_config import load_config, packaged
+    from thermostand.stand.running.opening.claim import claimed
+    from thermostand.stand.running.opening.stand_latch import StandLatch
 
     async def cleared() -> bool:
         stand = load_config(packaged("", config))

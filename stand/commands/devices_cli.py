@@ -8,13 +8,20 @@ from typing import Annotated
 
 import typer
 
-from drivers.wires.camera_settings import GigeCameraSettings
-from drivers.wires.discovery import FoundCamera, SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.output import show
-from foundation.usage import one_line
-from stand.config.stand_config import load_config, packaged
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.drivers.wires.discovery import (
+    FoundCamera,
+    SerialPort,
+    UsbDevice,
+    cameras_at,
+    serial_ports,
+    usb_devices,
+)
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.output import show
+from thermostand.foundation.usage import one_line
+from thermostand.stand.config.stand_config import load_config, packaged
 
 app = App()
 

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from stand.commands.reached import on_stand
-from stand.serving.client import Server
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.commands.reached import on_stand
+from thermostand.stand.serving.client import Server
 
 app = App()
 _LOOK_S = 0.5
@@ -28,10 +28,10 @@ def foxglove(
     Example: stand foxglove
     """
     try:
-        from stand.watching.foxglove_live import HOST, Published
+        from thermostand.stand.watching.foxglove_live import HOST, Published
     except ModuleNotFoundError as error:
         raise ConfigError("it needs foxglove-sdk: pip install 'thermostand[foxglove]'") from error
-    from stand.watching.there import There
+    from thermostand.stand.watching.there import There
 
     there = There(server)
     try:

@@ -12,14 +12,14 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from drivers.wires.discovery import SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.output import say, show
-from foundation.usage import one_line
-from stand.config.new_stand import Axis, Connected, new_stand
-from stand.estimating.run_estimate import price_night
-from stand.running.order import load_order
+from thermostand.drivers.wires.discovery import SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.output import say, show
+from thermostand.foundation.usage import one_line
+from thermostand.stand.config.new_stand import Axis, Connected, new_stand
+from thermostand.stand.estimating.run_estimate import price_night
+from thermostand.stand.running.order import load_order
 
 app = App()
 

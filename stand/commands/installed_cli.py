@@ -7,9 +7,9 @@ from pathlib import Path
 
 import yaml
 
-from foundation.command_app import App
-from foundation.output import show
-from foundation.usage import one_line
+from thermostand.foundation.command_app import App
+from thermostand.foundation.output import show
+from thermostand.foundation.usage import one_line
 
 app = App(no_args_is_help=True)
 
@@ -34,7 +34,7 @@ def configs() -> None:
 
 def _list(folder: str, described_by: str) -> None:
     found: list[dict[str, str]] = []
-    for path in sorted((Path(str(importlib.resources.files("configs"))) / folder).glob("*.yaml")):
+    for path in sorted((Path(str(importlib.resources.files("thermostand.configs"))) / folder).glob("*.yaml")):
         data: object = yaml.safe_load(path.read_text(encoding="utf-8"))
         text = str(data.get(described_by, "")) if isinstance(data, dict) else ""
         found.append({"name": path.stem, "text": text, "path": str(path)})

@@ -12,11 +12,11 @@ from urllib.parse import quote
 import typer
 from pydantic import JsonValue
 
-from foundation.command_app import App
-from foundation.errors import ConfigError, SessionError
-from foundation.output import say, show
-from foundation.usage import one_line
-from stand.commands.reached import (
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.output import say, show
+from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.reached import (
     ConfigOption,
     DirectoryOption,
     RecipeArgument,
@@ -25,9 +25,9 @@ from stand.commands.reached import (
     on_stand,
     reached,
 )
-from stand.commands.submitted import submit_recipe
-from stand.serving.client import API, Answer, Server, running_sessions
-from stand.serving.desk import DeviceState, StandState
+from thermostand.stand.commands.submitted import submit_recipe
+from thermostand.stand.serving.client import API, Answer, Server, running_sessions
+from thermostand.stand.serving.desk import DeviceState, StandState
 
 app = App()
 
@@ -105,8 +105,8 @@ def _by_daemon(server: Server, name: str, verb: str, arguments: dict[str, object
 
 def _without_daemon(config: str, name: str, verb: str, arguments: dict[str, object], out: Path | None) -> None:
     # Opening devices takes half a second of imports, which a client of the daemon need not wait for.
-    from stand.config.stand_config import load_config, packaged
-    from stand.daemon.hands_on import by_hand, known_devices
+    from thermostand.stand.config.stand_config import load_config, packaged
+    from thermostand.stand.daemon.hands_on import by_hand, known_devices
 
     stand = load_config(packaged("", config))
     others = ", ".join(map(str, running_sessions()))

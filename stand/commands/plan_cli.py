@@ -10,22 +10,28 @@ from typing import Annotated
 
 import typer
 
-from experiments.looks import looks_of
-from experiments.steps import Step
-from foundation.clock import WallClock, seconds_ns
-from foundation.command_app import App
-from foundation.ending import Ending
-from foundation.instants import local_text, utc_text
-from foundation.output import say, show
-from stand.commands.reached import ConfigArgument, ConfigOption, ConfigOrOption, RecipeArgument, named_config
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.absent import absences
-from stand.estimating.camera_lines import camera_lines
-from stand.estimating.estimate import PricedStep
-from stand.estimating.learned import load_learned
-from stand.estimating.run_estimate import price_night
-from stand.running.order import load_order
-from stand.simulator import Simulator, laboratory_of, list_faults
+from thermostand.experiments.looks import looks_of
+from thermostand.experiments.steps import Step
+from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.command_app import App
+from thermostand.foundation.ending import Ending
+from thermostand.foundation.instants import local_text, utc_text
+from thermostand.foundation.output import say, show
+from thermostand.stand.commands.reached import (
+    ConfigArgument,
+    ConfigOption,
+    ConfigOrOption,
+    RecipeArgument,
+    named_config,
+)
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.estimating.absent import absences
+from thermostand.stand.estimating.camera_lines import camera_lines
+from thermostand.stand.estimating.estimate import PricedStep
+from thermostand.stand.estimating.learned import load_learned
+from thermostand.stand.estimating.run_estimate import price_night
+from thermostand.stand.running.order import load_order
+from thermostand.stand.simulator import Simulator, laboratory_of, list_faults
 
 app = App()
 

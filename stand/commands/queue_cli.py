@@ -9,20 +9,20 @@ from typing import Annotated
 
 import typer
 
-from foundation.clock import WallClock
-from foundation.command_app import App
-from foundation.errors import Interrupted
-from foundation.exit_codes import INTERRUPTED
-from foundation.instants import date_time, duration
-from foundation.output import say, show
-from foundation.usage import one_line
-from stand.commands.queue_door import DaemonDoor, Door, OutOption, at_door, directory_of
-from stand.commands.reached import ConfigOption, RecipeArgument
-from stand.queueing import queue
-from stand.queueing.queue_file import Entry
-from stand.queueing.queue_run import conclude, run_entry
-from stand.queueing.queue_work import Notes, work
-from stand.serving.desk import QueuedRun
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import Interrupted
+from thermostand.foundation.exit_codes import INTERRUPTED
+from thermostand.foundation.instants import date_time, duration
+from thermostand.foundation.output import say, show
+from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.queue_door import DaemonDoor, Door, OutOption, at_door, directory_of
+from thermostand.stand.commands.reached import ConfigOption, RecipeArgument
+from thermostand.stand.queueing import queue
+from thermostand.stand.queueing.queue_file import Entry
+from thermostand.stand.queueing.queue_run import conclude, run_entry
+from thermostand.stand.queueing.queue_work import Notes, work
+from thermostand.stand.serving.desk import QueuedRun
 
 app = App(
     no_args_is_help=True,

@@ -9,21 +9,21 @@ from typing import Annotated, Any
 
 import typer
 
-from foundation.clock import WallClock
-from foundation.command_app import with_parameters
-from foundation.errors import ConfigError, InUse, SessionError
-from foundation.output import say
-from stand.commands.reached import OPTIONS
-from stand.commands.submitted import submit_recipe
-from stand.commissioning.answering import not_answering
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.estimating.run_estimate import price_night, small_disk
-from stand.queueing import queue
-from stand.queueing.queue_file import Entry
-from stand.running.order import load_order
-from stand.serving.client import API, Server, server_at
-from stand.serving.desk import QueuedRun
-from stand.serving.presence import living
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.command_app import with_parameters
+from thermostand.foundation.errors import ConfigError, InUse, SessionError
+from thermostand.foundation.output import say
+from thermostand.stand.commands.reached import OPTIONS
+from thermostand.stand.commands.submitted import submit_recipe
+from thermostand.stand.commissioning.answering import not_answering
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.estimating.run_estimate import price_night, small_disk
+from thermostand.stand.queueing import queue
+from thermostand.stand.queueing.queue_file import Entry
+from thermostand.stand.running.order import load_order
+from thermostand.stand.serving.client import API, Server, server_at
+from thermostand.stand.serving.desk import QueuedRun
+from thermostand.stand.serving.presence import living
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Where the queue is and its sessions go; else recording.directory.")

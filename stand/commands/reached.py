@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from foundation.command_app import with_parameters
-from foundation.errors import ConfigError, NotThere, SessionError
-from stand.serving.client import Server, running_sessions, server_at, server_of
+from thermostand.foundation.command_app import with_parameters
+from thermostand.foundation.errors import ConfigError, NotThere, SessionError
+from thermostand.stand.serving.client import Server, running_sessions, server_at, server_of
 
 DirectoryArgument = Annotated[
     Path | None,
@@ -83,8 +83,8 @@ def _running(directory: Path | None, config: str, *, anywhere: bool) -> Path:
     if len(everywhere) == 1:  # no configuration need be read: STOP is quick
         return everywhere[0]
     # Reading a configuration takes longer than all the rest.
-    from recording.format.inventory import inventory
-    from stand.config.stand_config import load_config, packaged
+    from thermostand.recording.format.inventory import inventory
+    from thermostand.stand.config.stand_config import load_config, packaged
 
     root = directory or load_config(packaged("", config)).recording.directory
     sessions = running_sessions(root) or everywhere

@@ -8,11 +8,11 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from foundation.errors import ConfigError
-from foundation.events import TOKENS_NOT_READ, TOKENS_READ
-from foundation.items import Event
-from stand.config.interface_section import TokenFile, load_tokens
-from stand.serving.api.token_book import TokenBook
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.events import TOKENS_NOT_READ, TOKENS_READ
+from thermostand.foundation.items import Event
+from thermostand.stand.config.interface_section import TokenFile, load_tokens
+from thermostand.stand.serving.api.token_book import TokenBook
 
 Tell = Callable[[Event], None]
 

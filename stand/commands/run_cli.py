@@ -12,26 +12,26 @@ from typing import Annotated
 
 import typer
 
-from foundation.command_app import App
-from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import NOT_REPORTED
-from foundation.output import output, say, show
-from foundation.usage import failed
-from recording.repair.salvage import salvage_line
-from stand.commands.checked_cli import warn_unchecked
-from stand.commands.reached import ConfigOption, RecipeArgument, TokenOption, UrlOption
-from stand.commands.submitted import daemon_of, follow, submit, submit_recipe, submit_resumed
-from stand.config.checked import load_checked
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.estimating.learned import learn
-from stand.estimating.run_estimate import existing, price_night, small_disk
-from stand.running.order import load_order
-from stand.running.resume import interruption, is_of_virtual_time
-from stand.running.run import resume, run_real, run_virtual
-from stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
-from stand.serving.client import Server, server_at
-from stand.serving.desk import QueuedRun
-from stand.watching.live import followed
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.exit_codes import NOT_REPORTED
+from thermostand.foundation.output import output, say, show
+from thermostand.foundation.usage import failed
+from thermostand.recording.repair.salvage import salvage_line
+from thermostand.stand.commands.checked_cli import warn_unchecked
+from thermostand.stand.commands.reached import ConfigOption, RecipeArgument, TokenOption, UrlOption
+from thermostand.stand.commands.submitted import daemon_of, follow, submit, submit_recipe, submit_resumed
+from thermostand.stand.config.checked import load_checked
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.estimating.learned import learn
+from thermostand.stand.estimating.run_estimate import existing, price_night, small_disk
+from thermostand.stand.running.order import load_order
+from thermostand.stand.running.resume import interruption, is_of_virtual_time
+from thermostand.stand.running.run import resume, run_real, run_virtual
+from thermostand.stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
+from thermostand.stand.serving.client import Server, server_at
+from thermostand.stand.serving.desk import QueuedRun
+from thermostand.stand.watching.live import followed
 
 app = App()
 

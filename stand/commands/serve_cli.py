@@ -11,33 +11,33 @@ from typing import Annotated, Any
 
 import typer
 
-from foundation.clock import WallClock
-from foundation.command_app import App
-from foundation.documents import read_document
-from foundation.errors import ConfigError
-from foundation.events import KINDS, LOOPBACK_TRUSTED, OPEN
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.output import Output, json_line, output, say
-from foundation.usage import one_line
-from stand.commands.checked_cli import warn_unchecked
-from stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
-from stand.commands.reloading import Reloading
-from stand.config.checked import ATTACHMENT, load_checked
-from stand.config.interface_section import load_tokens
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.daemon.daemon_desk import DaemonDesk
-from stand.daemon.serve import serve as serve_stand
-from stand.running.order import optics_texts
-from stand.serving.api.bridge import Bridge
-from stand.serving.api.doors import Interface
-from stand.serving.api.server import serve as serve_clients
-from stand.serving.api.server import try_doors
-from stand.serving.api.token_book import TokenBook
-from stand.serving.secop.door import door_at
-from stand.serving.viewing import Viewing
-from stand.watching.aside import aside
-from stand.watching.remedies import next_command
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.command_app import App
+from thermostand.foundation.documents import read_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.events import KINDS, LOOPBACK_TRUSTED, OPEN
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.output import Output, json_line, output, say
+from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.checked_cli import warn_unchecked
+from thermostand.stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
+from thermostand.stand.commands.reloading import Reloading
+from thermostand.stand.config.checked import ATTACHMENT, load_checked
+from thermostand.stand.config.interface_section import load_tokens
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.daemon.daemon_desk import DaemonDesk
+from thermostand.stand.daemon.serve import serve as serve_stand
+from thermostand.stand.running.order import optics_texts
+from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.server import serve as serve_clients
+from thermostand.stand.serving.api.server import try_doors
+from thermostand.stand.serving.api.token_book import TokenBook
+from thermostand.stand.serving.secop.door import door_at
+from thermostand.stand.serving.viewing import Viewing
+from thermostand.stand.watching.aside import aside
+from thermostand.stand.watching.remedies import next_command
 
 app = App()
 _HERE = "127.0.0.1"
@@ -128,7 +128,7 @@ def _events_shown(hub: Hub) -> Generator[None]:
 
 def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
     def room(bridge: Bridge) -> Any:
-        from stand.serving.page_room import PageRoom  # FastAPI, which the thread loads that serves clients
+        from thermostand.stand.serving.page_room import PageRoom  # FastAPI, which the thread loads that serves clients
 
         return PageRoom(viewing)(bridge)
 

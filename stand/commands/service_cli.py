@@ -11,14 +11,14 @@ from typing import Annotated
 
 import typer
 
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.files import write_whole
-from foundation.output import say, show
-from stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.opening.stand_latch import SYSTEM_FOLDER
-from stand.serving.presence import STANDS_FOLDER
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.files import write_whole
+from thermostand.foundation.output import say, show
+from thermostand.stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.running.opening.stand_latch import SYSTEM_FOLDER
+from thermostand.stand.serving.presence import STANDS_FOLDER
 
 app = App()
 
@@ -85,7 +85,7 @@ def unit_name(stand: StandConfig) -> str:
 
 def unit(config: Path, stand: StandConfig, user: str, port: int | None) -> str:
     """The unit: restarted when it dies, watched, and given the time that making safe takes."""
-    arguments = [sys.executable, "-m", "stand.cli", "serve", str(config)]
+    arguments = [sys.executable, "-m", "thermostand.stand.cli", "serve", str(config)]
     arguments += [] if port is None else ["--port", str(port)]
     return f"""[Unit]
 Description=Thermal stand {_of_unit(stand.name)}

@@ -11,17 +11,17 @@ from urllib.parse import quote
 
 from pydantic import ValidationError
 
-from foundation.documents import read_document
-from foundation.errors import ConfigError, Interrupted, SessionError, StandError
-from stand.config.stand_config import StandConfig
-from stand.running.opening.claim import daemon_pid
-from stand.running.order import Order
-from stand.serving.client import API, Server
-from stand.serving.desk import QueuedRun, StandState
-from stand.serving.presence import living
-from stand.watching.live import View, view
-from stand.watching.moment import Moment
-from stand.watching.there import There
+from thermostand.foundation.documents import read_document
+from thermostand.foundation.errors import ConfigError, Interrupted, SessionError, StandError
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.opening.claim import daemon_pid
+from thermostand.stand.running.order import Order
+from thermostand.stand.serving.client import API, Server
+from thermostand.stand.serving.desk import QueuedRun, StandState
+from thermostand.stand.serving.presence import living
+from thermostand.stand.watching.live import View, view
+from thermostand.stand.watching.moment import Moment
+from thermostand.stand.watching.there import There
 
 _LOOK_S = 0.5
 _QUEUE_LIMIT_S = 60.0  # the wires of the stand are asked when a run is queued

@@ -8,11 +8,11 @@ from typing import Annotated, cast
 
 import typer
 
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.output import output, say, show
-from stand.commands.reached import ConfigOption, DirectoryArgument, reached
-from stand.serving.client import API, Answer
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.output import output, say, show
+from thermostand.stand.commands.reached import ConfigOption, DirectoryArgument, reached
+from thermostand.stand.serving.client import API, Answer
 
 app = App(
     no_args_is_help=True,
@@ -33,7 +33,7 @@ def add(
 
     Example: stand token add rose --config my-stand.yaml
     """
-    from stand.config.interface_section import TokenFile, load_tokens, write_tokens
+    from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
 
     path = _file(config)
     known = load_tokens(path) if path.expanduser().exists() else TokenFile()
@@ -56,7 +56,7 @@ def list_names(config: ConfigOption = "simulated") -> None:
 
     Example: stand token list --config my-stand.yaml
     """
-    from stand.config.interface_section import load_tokens
+    from thermostand.stand.config.interface_section import load_tokens
 
     found = [(name, read_only) for name, (_, read_only) in sorted(load_tokens(_file(config)).by_name().items())]
     lines = [f"{name}  read-only" if read_only else name for name, read_only in found]
@@ -69,7 +69,7 @@ def remove(name: NameArgument, config: ConfigOption = "simulated") -> None:
 
     Example: stand token remove rose --config my-stand.yaml
     """
-    from stand.config.interface_section import load_tokens, write_tokens
+    from thermostand.stand.config.interface_section import load_tokens, write_tokens
 
     path = _file(config)
     known = load_tokens(path)
@@ -103,7 +103,7 @@ def _say_when(what: str) -> None:
 
 
 def _file(config: str) -> Path:
-    from stand.config.stand_config import load_config, packaged
+    from thermostand.stand.config.stand_config import load_config, packaged
 
     stand = load_config(packaged("", config))
     if stand.interface.secrets is None:

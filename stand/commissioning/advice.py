@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.settings import OnBus
-from foundation.errors import DeviceError, GarbledReply, InUse, Refused, Unreachable
-from stand.config.stand_config import StandConfig
+from thermostand.drivers.settings import OnBus
+from thermostand.foundation.errors import DeviceError, GarbledReply, InUse, Refused, Unreachable
+from thermostand.stand.config.stand_config import StandConfig
 
 
 def for_bus(error: DeviceError, *, is_simulated: bool) -> str:

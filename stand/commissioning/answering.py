@@ -10,15 +10,15 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 
-from drivers.devices.protocols import Controller
-from drivers.devices.relays import CAMERA_POWER
-from drivers.wires.camera_settings import GigeCameraSettings
-from drivers.wires.discovery import FoundCamera, cameras_at
-from drivers.wires.modbus_unit import ModbusUnit
-from foundation.errors import DeviceError, DeviceFault
-from stand.assembly import Assembly, register_map
-from stand.config.stand_config import StandConfig
-from stand.running.opening.open_stand import at_bench
+from thermostand.drivers.devices.protocols import Controller
+from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.drivers.wires.discovery import FoundCamera, cameras_at
+from thermostand.drivers.wires.modbus_unit import ModbusUnit
+from thermostand.foundation.errors import DeviceError, DeviceFault
+from thermostand.stand.assembly import Assembly, register_map
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.opening.open_stand import at_bench
 
 COMMAND = "stand queue add"
 _CAMERA_WAIT_S = 1.0  # for its answer to GVCP's discovery

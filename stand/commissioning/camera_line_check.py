@@ -5,9 +5,9 @@ from __future__ import annotations
 import socket
 from dataclasses import asdict
 
-from stand.commissioning.finding import Finding
-from stand.config.stand_config import StandConfig
-from stand.estimating.camera_lines import camera_lines
+from thermostand.stand.commissioning.finding import Finding
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.camera_lines import camera_lines
 
 _IP_MTU = 14  # linux/in.h
 _GVCP = 3956

@@ -11,18 +11,18 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack
 from functools import partial
 
-from drivers.devices.protocols import Actuator
-from drivers.settings import Identity
-from foundation.errors import Unreachable
-from stand.assembly import Assembly
-from stand.commissioning import host
-from stand.commissioning.camera_line_check import shared_lines
-from stand.commissioning.finding import Finding
-from stand.commissioning.links import Links
-from stand.commissioning.moves import Moves
-from stand.config.stand_config import StandConfig
-from stand.running.opening.open_stand import at_bench, made_safe
-from stand.running.opening.stop import Stop
+from thermostand.drivers.devices.protocols import Actuator
+from thermostand.drivers.settings import Identity
+from thermostand.foundation.errors import Unreachable
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.commissioning import host
+from thermostand.stand.commissioning.camera_line_check import shared_lines
+from thermostand.stand.commissioning.finding import Finding
+from thermostand.stand.commissioning.links import Links
+from thermostand.stand.commissioning.moves import Moves
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.opening.open_stand import at_bench, made_safe
+from thermostand.stand.running.opening.stop import Stop
 
 COMMAND = "stand check"
 

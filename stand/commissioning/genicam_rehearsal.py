@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.devices.cameras.camera_gige import Settings as GigeSettings
-from drivers.wires import camera_dialects as words
-from foundation.clock import WallClock
-from foundation.errors import DeviceError, Unreachable
-from stand.config.simulation import SimulatedCamera
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.simulator import ControlSocket, Simulator, laboratory_of
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import Settings as GigeSettings
+from thermostand.drivers.wires import camera_dialects as words
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import DeviceError, Unreachable
+from thermostand.stand.config.simulation import SimulatedCamera
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 _NAME = "camera"
 _SET_BY = (*words.EXPOSURE, *words.EXPOSURE_STEP_US, *words.NECESSARY, "TriggerSoftware")

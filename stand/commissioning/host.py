@@ -8,9 +8,9 @@ import shutil
 import tempfile
 import time
 
-from stand.commissioning.finding import Finding
-from stand.config.stand_config import StandConfig
-from stand.estimating.run_estimate import existing
+from thermostand.stand.commissioning.finding import Finding
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.run_estimate import existing
 
 _PIECES, _PIECE_BYTES = 8, 4_000_000
 _SLOWEST_FLUSH_S = 1.0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, parse
-from drivers.devices.imager.thermal_imager import ThermalImagerSettings, place_of, spot_degC
-from stand.commissioning.finding import Finding
+from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, parse
+from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings, place_of, spot_degC
+from thermostand.stand.commissioning.finding import Finding
 
 _NAME = "imager"
 _PICTURES = {".jpg", ".jpeg"}

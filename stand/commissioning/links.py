@@ -10,20 +10,20 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, is_dataclass
 from typing import Any, cast
 
-from drivers.devices.protocols import Camera, Controller, Device, Sensor
-from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
-from drivers.devices.relays import CAMERA_POWER, HEAT
-from drivers.settings import OnBus
-from foundation.errors import DeviceError, StandError, Unreachable
-from foundation.readings import Quality, Reading
-from stand.assembly import Assembly, register_map
-from stand.chamber.permits import WATCHED
-from stand.commissioning import advice
-from stand.commissioning.camera_line_check import packet_finding
-from stand.commissioning.finding import Add, Finding
-from stand.commissioning.imager import imager_finding
-from stand.commissioning.thermometer_comparison import each_other
-from stand.commissioning.unverified_points import unverified_points
+from thermostand.drivers.devices.protocols import Camera, Controller, Device, Sensor
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
+from thermostand.drivers.devices.relays import CAMERA_POWER, HEAT
+from thermostand.drivers.settings import OnBus
+from thermostand.foundation.errors import DeviceError, StandError, Unreachable
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.stand.assembly import Assembly, register_map
+from thermostand.stand.chamber.permits import WATCHED
+from thermostand.stand.commissioning import advice
+from thermostand.stand.commissioning.camera_line_check import packet_finding
+from thermostand.stand.commissioning.finding import Add, Finding
+from thermostand.stand.commissioning.imager import imager_finding
+from thermostand.stand.commissioning.thermometer_comparison import each_other
+from thermostand.stand.commissioning.unverified_points import unverified_points
 
 _SHOWN = 6  # readings of one device in a line
 

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Awaitable
 
-from drivers.devices.protocols import Camera
-from foundation.clock import NS_PER_S, Clock
-from foundation.errors import DeviceError, StandError, StandTripped, Superseded
-from foundation.events import DEAD_MAN_TESTED, HOME_RESIDUAL, HOME_RESIDUAL_LARGE
-from foundation.items import Event, Item
-from foundation.readings import Quality
-from stand.assembly import Assembly
-from stand.commissioning import advice
-from stand.commissioning.finding import Add, Finding
-from stand.commissioning.links import Links, identity_finding
+from thermostand.drivers.devices.protocols import Camera
+from thermostand.foundation.clock import NS_PER_S, Clock
+from thermostand.foundation.errors import DeviceError, StandError, StandTripped, Superseded
+from thermostand.foundation.events import DEAD_MAN_TESTED, HOME_RESIDUAL, HOME_RESIDUAL_LARGE
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.readings import Quality
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.commissioning import advice
+from thermostand.stand.commissioning.finding import Add, Finding
+from thermostand.stand.commissioning.links import Links, identity_finding
 
 _FRAMES = 6
 _SLOW = 0.8  # of the longest travel that the stand's file allows

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import statistics
 
-from drivers.devices.protocols import Controller, Sensor
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError
-from foundation.readings import Quality
-from stand.commissioning.finding import Finding
+from thermostand.drivers.devices.protocols import Controller, Sensor
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError
+from thermostand.foundation.readings import Quality
+from thermostand.stand.commissioning.finding import Finding
 
 _LOOKS, _PERIOD_S = 5, 0.3
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import groupby
 
-from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import ModbusUnit, Sample
-from drivers.wires.registers import RegisterMap
-from foundation.errors import DeviceError, Refused
-from stand.commissioning.finding import Finding, Verdict
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.modbus_unit import ModbusUnit, Sample
+from thermostand.drivers.wires.registers import RegisterMap
+from thermostand.foundation.errors import DeviceError, Refused
+from thermostand.stand.commissioning.finding import Finding, Verdict
 
 
 async def unverified_points(

@@ -17,9 +17,9 @@ from typing import Any, cast, get_type_hints
 from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from experiments.sequence import MOST_STEPS
-from experiments.steps import Step
-from foundation.document_faults import words
+from thermostand.experiments.sequence import MOST_STEPS
+from thermostand.experiments.steps import Step
+from thermostand.foundation.document_faults import words
 
 GROUP = "thermostand.experiments"
 _AT_LEAST = {"frames": 1, "interval_s": 1e-6, "exposure_s": 1e-6}
@@ -81,7 +81,7 @@ def _loaded(point: EntryPoint) -> tuple[Callable[[BaseModel], object], type[Base
 def _fault(step: object) -> str:
     """Why this is no step that a stand can do; "" when it is one."""
     if not isinstance(step, Step):
-        return f"is no step of experiments.steps but {type(step).__name__}"
+        return f"is no step of thermostand.experiments.steps but {type(step).__name__}"
     for name in [field.name for field in fields(cast("Any", step))]:
         value = getattr(step, name)
         if name in ("axis", "text", "role", "on", "unsettled"):

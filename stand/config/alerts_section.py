@@ -7,9 +7,9 @@ from typing import get_args
 
 from pydantic import Field
 
-from foundation.documents import Document
-from foundation.events import AlertCause
-from stand.config.private_file import private_document
+from thermostand.foundation.documents import Document
+from thermostand.foundation.events import AlertCause
+from thermostand.stand.config.private_file import private_document
 
 
 class AlertsConfig(Document):

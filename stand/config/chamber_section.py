@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from foundation.documents import Document
+from thermostand.foundation.documents import Document
 
 
 class ChamberConfig(Document):

@@ -10,8 +10,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from foundation.documents import read_document
-from foundation.errors import ConfigError
+from thermostand.foundation.documents import read_document
+from thermostand.foundation.errors import ConfigError
 
 ATTACHMENT = "commissioning.json"  # its name in a session
 

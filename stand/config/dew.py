@@ -7,8 +7,8 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.settings import DeviceName
-from foundation.documents import Document
+from thermostand.drivers.settings import DeviceName
+from thermostand.foundation.documents import Document
 
 # Magnus' formula over water, with the constants of Sonntag, Z. Meteorol. 70 (1990) 340, -45..60 degC.
 _A, _B_degC = 17.62, 243.12

@@ -6,8 +6,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from foundation.documents import Document
-from stand.config.chamber_section import (
+from thermostand.foundation.documents import Document
+from thermostand.stand.config.chamber_section import (
     CameraFeelsConfig,
     FirstHeatConfig,
     FrozenConfig,

@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from foundation.errors import ConfigError
-from stand.config.stand_config import Folder, packaged
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import Folder, packaged
 
 _SCHEMA = re.compile(r"\$schema=\S+/([a-z-]+\.json)")
 _README = """\

@@ -6,8 +6,8 @@ import os
 import stat
 from pathlib import Path
 
-from foundation.documents import Model, parse_document
-from foundation.errors import ConfigError
+from thermostand.foundation.documents import Model, parse_document
+from thermostand.foundation.errors import ConfigError
 
 _LARGEST_BYTES = 100_000
 

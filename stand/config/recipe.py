@@ -8,15 +8,15 @@ from typing import Self, cast
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from experiments.calibration import Calibration, calibration
-from experiments.sequence import checked
-from experiments.steps import PlannedStep, Situation, Step, number_steps
-from experiments.thermal_cycle import ThermalCycle, thermal_cycle
-from experiments.validation import Validation, validation
-from experiments.warm_up import WarmUp, warm_up
-from experiments.written import Place, PlanError, StepEntries, Written, unknown, written_steps
-from foundation.documents import Document
-from stand.config.added_experiments import added_names, added_steps, package_of
+from thermostand.experiments.calibration import Calibration, calibration
+from thermostand.experiments.sequence import checked
+from thermostand.experiments.steps import PlannedStep, Situation, Step, number_steps
+from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from thermostand.experiments.validation import Validation, validation
+from thermostand.experiments.warm_up import WarmUp, warm_up
+from thermostand.experiments.written import Place, PlanError, StepEntries, Written, unknown, written_steps
+from thermostand.foundation.documents import Document
+from thermostand.stand.config.added_experiments import added_names, added_steps, package_of
 
 _MADE_BY: Mapping[str, Callable[..., Iterable[Step]]] = {
     "warm_up": warm_up,

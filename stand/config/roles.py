@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from drivers.devices.thermometers import PLACES, Role, ThermometerSettings, by_channel
+from thermostand.drivers.devices.thermometers import PLACES, Role, ThermometerSettings, by_channel
 
 GUARDED: tuple[Role, ...] = ("air",)  # without which nothing is heated
 

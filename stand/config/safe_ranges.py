@@ -13,7 +13,7 @@ from operator import attrgetter
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from drivers.devices.thermometers import PLAUSIBLE_DEGC, ThermometerSettings
+from thermostand.drivers.devices.thermometers import PLAUSIBLE_DEGC, ThermometerSettings
 
 _MOST_K = 1e9  # JSON has no infinity
 

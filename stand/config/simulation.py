@@ -8,10 +8,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
-from drivers.camera_preset import Effect
-from drivers.settings import DeviceName
-from foundation.addresses import TcpAddress
-from foundation.documents import Document
+from thermostand.drivers.camera_preset import Effect
+from thermostand.drivers.settings import DeviceName
+from thermostand.foundation.addresses import TcpAddress
+from thermostand.foundation.documents import Document
 
 
 def _printable(path: Path) -> Path:

@@ -13,32 +13,32 @@ from typing import Annotated, Literal, Self, cast
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
-from drivers.camera_preset import CameraPreset
-from drivers.devices.cameras.cameras_by_protocol import AnyCameraSettings
-from drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
-from drivers.devices.imager.thermal_imager import ThermalImagerSettings
-from drivers.devices.inputs import InputsSettings
-from drivers.devices.motion.flap import FlapSettings
-from drivers.devices.motion.stage import AxisSettings
-from drivers.devices.probes import ProbeSettings
-from drivers.devices.regulators.heat_module import HeatModuleSettings
-from drivers.devices.regulators.pid import split
-from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
-from drivers.devices.relays import HEAT, RelaysSettings
-from drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings, by_channel
-from drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
-from drivers.wires.bus import BusSettings
-from experiments.parameters import Chamber_degC
-from foundation.documents import Document, load_document
-from foundation.errors import ConfigError
-from stand.config.alerts_section import AlertsConfig
-from stand.config.chamber_section import ChamberConfig
-from stand.config.dew import DewConfig, EndingConfig
-from stand.config.guard_section import GuardConfig
-from stand.config.interface_section import InterfaceConfig
-from stand.config.roles import unfit_roles, witnesses
-from stand.config.safe_ranges import check, outside
-from stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
+from thermostand.drivers.camera_preset import CameraPreset
+from thermostand.drivers.devices.cameras.cameras_by_protocol import AnyCameraSettings
+from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
+from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings
+from thermostand.drivers.devices.inputs import InputsSettings
+from thermostand.drivers.devices.motion.flap import FlapSettings
+from thermostand.drivers.devices.motion.stage import AxisSettings
+from thermostand.drivers.devices.probes import ProbeSettings
+from thermostand.drivers.devices.regulators.heat_module import HeatModuleSettings
+from thermostand.drivers.devices.regulators.pid import split
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
+from thermostand.drivers.devices.relays import HEAT, RelaysSettings
+from thermostand.drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings, by_channel
+from thermostand.drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
+from thermostand.drivers.wires.bus import BusSettings
+from thermostand.experiments.parameters import Chamber_degC
+from thermostand.foundation.documents import Document, load_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.alerts_section import AlertsConfig
+from thermostand.stand.config.chamber_section import ChamberConfig
+from thermostand.stand.config.dew import DewConfig, EndingConfig
+from thermostand.stand.config.guard_section import GuardConfig
+from thermostand.stand.config.interface_section import InterfaceConfig
+from thermostand.stand.config.roles import unfit_roles, witnesses
+from thermostand.stand.config.safe_ranges import check, outside
+from thermostand.stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
 
 
 def _kind_of(regulator: object) -> str:
@@ -382,7 +382,7 @@ def packaged(folder: Folder, name: str, beside: Path | None = None, key: str = "
 
     Raises ConfigError that lists what there is.
     """
-    root = Path(str(importlib.resources.files("configs"))) / folder
+    root = Path(str(importlib.resources.files("thermostand.configs"))) / folder
     known = sorted(path.stem for path in root.glob("*.yaml"))
     named_by = (f"{beside}: " if beside else "") + (f"{key}: " if key else "")
     for candidate in (beside.parent / name if beside else Path(name), Path(name), root / name, root / f"{name}.yaml"):

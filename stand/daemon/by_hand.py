@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 from pydantic import JsonValue
 
-from drivers.devices.regulators.software_regulator import SoftwareRegulator
-from experiments.steps import MoveTo, SetTemperature, Step, number_steps
-from foundation.errors import ConfigError, DeviceError
-from foundation.items import Batch
-from stand.assembly import Assembly, device_kinds
-from stand.estimating.estimate import price
-from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb, Missing
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
+from thermostand.experiments.steps import MoveTo, SetTemperature, Step, number_steps
+from thermostand.foundation.errors import ConfigError, DeviceError
+from thermostand.foundation.items import Batch
+from thermostand.stand.assembly import Assembly, device_kinds
+from thermostand.stand.estimating.estimate import price
+from thermostand.stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb, Missing
 
 Work = Coroutine[None, None, object]
 Arguments = Mapping[str, JsonValue]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch, Item
-from foundation.readings import Quality, Reading
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Item
+from thermostand.foundation.readings import Quality, Reading
 
 _UNSEEN_NS = seconds_ns(60.0)  # between two readings: what happened in a longer gap is unknown, and not counted
 _S_PER_H = 3600.0

@@ -14,10 +14,10 @@ from typing import cast
 
 from pydantic import JsonValue
 
-from drivers.devices.relays import CAMERA_POWER
-from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
-from foundation.events import (
+from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
+from thermostand.foundation.events import (
     BY_HAND_FAILED,
     CAMERA_NOT_OPENED,
     GUARD,
@@ -32,26 +32,26 @@ from foundation.events import (
     RUN_FAILED,
     EventKind,
 )
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.tasks import cancelled, failure_text, watched
-from recording.writing.recorder import FINISH_WITHIN_S
-from stand.daemon import systemd
-from stand.daemon.by_hand import ByHand
-from stand.daemon.counters import Counters
-from stand.daemon.daemon_file import Kept, KeptFile
-from stand.daemon.day_record import DayRecord
-from stand.daemon.orders import Orders
-from stand.fault import Fault
-from stand.gate import INTERLOCK
-from stand.queueing.queue_file import Entry
-from stand.queueing.queue_work import Notes, drain
-from stand.running.guest import Guest
-from stand.running.opening.open_stand import OpenStand
-from stand.running.opening.stand_latch import LatchedFault
-from stand.running.opening.stop import STOPPED, catch_signals
-from stand.running.opening.writer_restarts import WriterRestarts
-from stand.serving.desk import Conflict
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.tasks import cancelled, failure_text, watched
+from thermostand.recording.writing.recorder import FINISH_WITHIN_S
+from thermostand.stand.daemon import systemd
+from thermostand.stand.daemon.by_hand import ByHand
+from thermostand.stand.daemon.counters import Counters
+from thermostand.stand.daemon.daemon_file import Kept, KeptFile
+from thermostand.stand.daemon.day_record import DayRecord
+from thermostand.stand.daemon.orders import Orders
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.queueing.queue_file import Entry
+from thermostand.stand.queueing.queue_work import Notes, drain
+from thermostand.stand.running.guest import Guest
+from thermostand.stand.running.opening.open_stand import OpenStand
+from thermostand.stand.running.opening.stand_latch import LatchedFault
+from thermostand.stand.running.opening.stop import STOPPED, catch_signals
+from thermostand.stand.running.opening.writer_restarts import WriterRestarts
+from thermostand.stand.serving.desk import Conflict
 
 # What answers the clients of a daemon while inside.
 Answering = Callable[[Hub, WallClock], AbstractAsyncContextManager[object]]

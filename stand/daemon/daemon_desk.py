@@ -8,15 +8,15 @@ from typing import NoReturn, TypeVar
 
 from pydantic import JsonValue
 
-from foundation.errors import StandError
-from foundation.patience import Patience
-from stand.daemon.daemon import Daemon
-from stand.gate import INTERLOCK
-from stand.running.run_desk import RunDesk
-from stand.running.said import Said, keep
-from stand.running.simulated_faults import break_or_mend, simulated_faults
-from stand.serving.command_event import command_event
-from stand.serving.desk import (
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.patience import Patience
+from thermostand.stand.daemon.daemon import Daemon
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.running.run_desk import RunDesk
+from thermostand.stand.running.said import Said, keep
+from thermostand.stand.running.simulated_faults import break_or_mend, simulated_faults
+from thermostand.stand.serving.command_event import command_event
+from thermostand.stand.serving.desk import (
     Conflict,
     DeviceState,
     Done,
@@ -33,8 +33,8 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.plan_faults import PlanCheck
-from stand.serving.seen import seen_state
+from thermostand.stand.serving.plan_faults import PlanCheck
+from thermostand.stand.serving.seen import seen_state
 
 Result = TypeVar("Result")
 _NOTHING_RUNS = "nothing is run now"

@@ -12,13 +12,13 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from foundation.calls import Lane
-from foundation.clock import Clock
-from foundation.events import DAEMON_NOT_KEPT
-from foundation.files import replace_file
-from foundation.hub import Hub
-from foundation.patience import Patience
-from foundation.sealed import seal, unseal
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.events import DAEMON_NOT_KEPT
+from thermostand.foundation.files import replace_file
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.sealed import seal, unseal
 
 NAME = "daemon.json"
 _KIND = "counters"

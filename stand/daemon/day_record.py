@@ -18,23 +18,23 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from foundation.calls import Lane
-from foundation.clock import NS_PER_S, WallClock
-from foundation.errors import SessionError
-from foundation.events import IDLE_LOGS_REMOVED, RUN_END
-from foundation.hub import Hub, Subscriber
-from foundation.items import Item
-from foundation.patience import Patience
-from foundation.tasks import cancelled
-from recording.exporting.archive import DELETED
-from recording.reading.notes import read_notes
-from recording.reading.run_word import Run
-from recording.reading.session import Session
-from recording.writing.disk import Disk
-from recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
-from recording.writing.recorder_settings import SessionInfo
-from stand.assembly import Assembly
-from stand.running.session_files import info_of, recorder_in, tell_identities
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import IDLE_LOGS_REMOVED, RUN_END
+from thermostand.foundation.hub import Hub, Subscriber
+from thermostand.foundation.items import Item
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.tasks import cancelled
+from thermostand.recording.exporting.archive import DELETED
+from thermostand.recording.reading.notes import read_notes
+from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
+from thermostand.recording.writing.recorder_settings import SessionInfo
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.running.session_files import info_of, recorder_in, tell_identities
 
 BETWEEN_RUNS = "house"  # in place of a recipe's name
 _NAME = re.compile(rf"([0-9]{{8}})-{BETWEEN_RUNS}(-[0-9]+)?")

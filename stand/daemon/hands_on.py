@@ -15,22 +15,22 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from drivers.devices.protocols import Sensor
-from drivers.settings import OnBus
-from drivers.wires.modbus_unit import ModbusUnit
-from foundation.clock import WallClock, seconds_ns
-from foundation.errors import ConfigError, DeviceError, StandTripped
-from foundation.files import write_whole_bytes
-from foundation.hub import Hub
-from foundation.readings import Reading
-from foundation.repeats import RepeatLimit
-from recording.format.images import encode_png
-from stand.assembly import Assembly, assemble, device_kinds, register_map
-from stand.config.stand_config import StandConfig
-from stand.daemon.by_hand import ByHand
-from stand.running.opening.open_stand import at_bench, made_safe
-from stand.running.opening.stop import Stop
-from stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb
+from thermostand.drivers.devices.protocols import Sensor
+from thermostand.drivers.settings import OnBus
+from thermostand.drivers.wires.modbus_unit import ModbusUnit
+from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.errors import ConfigError, DeviceError, StandTripped
+from thermostand.foundation.files import write_whole_bytes
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Reading
+from thermostand.foundation.repeats import RepeatLimit
+from thermostand.recording.format.images import encode_png
+from thermostand.stand.assembly import Assembly, assemble, device_kinds, register_map
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.daemon.by_hand import ByHand
+from thermostand.stand.running.opening.open_stand import at_bench, made_safe
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb
 
 COMMAND = "stand device"
 READ, REGISTERS, GRAB = "read", "registers", "grab"

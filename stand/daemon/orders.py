@@ -14,31 +14,31 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from experiments.steps import Capture
-from foundation.calls import Lane
-from foundation.errors import ConfigError, Interrupted, SessionError, StandError
-from foundation.hub import Hub
-from foundation.readings import Quality
-from recording.reading.session import Session
-from recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, Disk, DiskCalls
-from stand.config.checked import ATTACHMENT
-from stand.config.stand_config import StandConfig
-from stand.estimating.learned import learn
-from stand.estimating.run_estimate import Night, price_night, small_disk
-from stand.queueing import queue
-from stand.queueing.queue import Asked, order_of
-from stand.queueing.queue_file import Entry, Queue, State, worked_on
-from stand.queueing.queue_run import Watch, interruption_of, is_complete
-from stand.queueing.queue_work import Halt, Notes, Stopped
-from stand.running.executing.settling_watch import load_for
-from stand.running.guest import Job
-from stand.running.opening.open_stand import OpenStand
-from stand.running.opening.stop import Stop
-from stand.running.order import Order, attached_optics, check_plan, parse_order
-from stand.running.resume import Interruption, repaired
-from stand.running.run import run_in
-from stand.running.said import Said, keep
-from stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.errors import ConfigError, Interrupted, SessionError, StandError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Quality
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, Disk, DiskCalls
+from thermostand.stand.config.checked import ATTACHMENT
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.learned import learn
+from thermostand.stand.estimating.run_estimate import Night, price_night, small_disk
+from thermostand.stand.queueing import queue
+from thermostand.stand.queueing.queue import Asked, order_of
+from thermostand.stand.queueing.queue_file import Entry, Queue, State, worked_on
+from thermostand.stand.queueing.queue_run import Watch, interruption_of, is_complete
+from thermostand.stand.queueing.queue_work import Halt, Notes, Stopped
+from thermostand.stand.running.executing.settling_watch import load_for
+from thermostand.stand.running.guest import Job
+from thermostand.stand.running.opening.open_stand import OpenStand
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.running.order import Order, attached_optics, check_plan, parse_order
+from thermostand.stand.running.resume import Interruption, repaired
+from thermostand.stand.running.run import run_in
+from thermostand.stand.running.said import Said, keep
+from thermostand.stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended
 
@@ -304,7 +304,7 @@ def _said(who: Who, note: str, tags: Sequence[str]) -> Said | None:
 
 def _installed(name: str) -> str:
     """The text of an installed recipe; Missing lists what there is."""
-    root = Path(str(importlib.resources.files("configs"))) / "recipes"
+    root = Path(str(importlib.resources.files("thermostand.configs"))) / "recipes"
     known = {path.stem: path for path in root.glob("*.yaml")}
     if name not in known:
         raise Missing(f"no recipe of that name is installed; there are {', '.join(sorted(known))}")

@@ -7,15 +7,15 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from foundation.calls import Lane
-from foundation.clock import Clock
-from foundation.errors import StandError
-from foundation.events import NOT_REPORTED, REPORT, REPORTED, EventKind
-from foundation.helper import Helper
-from foundation.hub import Hub
-from foundation.tasks import cancelled, failure_text
-from stand.running.session_report import report_session
-from stand.serving.preview_process import MODULE
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.events import NOT_REPORTED, REPORT, REPORTED, EventKind
+from thermostand.foundation.helper import Helper
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.tasks import cancelled, failure_text
+from thermostand.stand.running.session_report import report_session
+from thermostand.stand.serving.preview_process import MODULE
 
 _REPORT = "report"
 

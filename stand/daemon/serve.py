@@ -7,30 +7,30 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from pathlib import Path
 
-from foundation.clock import WallClock
-from foundation.errors import StandTripped
-from foundation.events import DAEMON_FILE_DAMAGED, LIMITS_ACCEPTED, SALVAGED
-from foundation.files import make_folder
-from foundation.hub import Hub
-from foundation.repeats import RepeatLimit
-from recording.repair.salvage import salvage_line, salvage_unfinished
-from recording.writing.disk import FILES_LINE
-from stand.assembly import assemble
-from stand.config.checked import ATTACHMENT
-from stand.config.safe_ranges import accepted_text
-from stand.config.stand_config import StandConfig
-from stand.daemon.daemon import Daemon
-from stand.daemon.daemon_desk import DaemonDesk
-from stand.daemon.daemon_file import KeptFile, kept_in
-from stand.daemon.day_record import DayRecord
-from stand.daemon.orders import Orders
-from stand.daemon.reports import Reports
-from stand.running.opening.claim import claimed
-from stand.running.opening.clock_watch import ClockWatch
-from stand.running.opening.open_stand import opened
-from stand.running.opening.stand_latch import StandLatch
-from stand.running.opening.stop import Stop
-from stand.serving.alerts import alerting
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import StandTripped
+from thermostand.foundation.events import DAEMON_FILE_DAMAGED, LIMITS_ACCEPTED, SALVAGED
+from thermostand.foundation.files import make_folder
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.repeats import RepeatLimit
+from thermostand.recording.repair.salvage import salvage_line, salvage_unfinished
+from thermostand.recording.writing.disk import FILES_LINE
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.checked import ATTACHMENT
+from thermostand.stand.config.safe_ranges import accepted_text
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.daemon.daemon import Daemon
+from thermostand.stand.daemon.daemon_desk import DaemonDesk
+from thermostand.stand.daemon.daemon_file import KeptFile, kept_in
+from thermostand.stand.daemon.day_record import DayRecord
+from thermostand.stand.daemon.orders import Orders
+from thermostand.stand.daemon.reports import Reports
+from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.opening.clock_watch import ClockWatch
+from thermostand.stand.running.opening.open_stand import opened
+from thermostand.stand.running.opening.stand_latch import StandLatch
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.serving.alerts import alerting
 
 # What answers the clients of the stand's desk while inside.
 Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[object]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from stand.config.stand_config import StandConfig
+from thermostand.stand.config.stand_config import StandConfig
 
 
 class Absence(NamedTuple):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.devices.cameras.camera_gige import Settings as GigeSettings
-from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
-from drivers.wires.camera_settings import frame_bytes
-from stand.config.stand_config import StandConfig
+from thermostand.drivers.devices.cameras.camera_gige import Settings as GigeSettings
+from thermostand.drivers.wires.camera_line import frame_wire_s, packet_delay_ns
+from thermostand.drivers.wires.camera_settings import frame_bytes
+from thermostand.stand.config.stand_config import StandConfig
 
 _SENSOR_PX = (2448, 2048)  # of a camera whose size nobody states, as in the plan's estimate of the disk
 _PACKET_SIZE = 1500  # of a camera that finds its own: what every network carries

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from foundation.clock import NS_PER_S
-from foundation.documents import Document
-from foundation.errors import SessionError
-from foundation.items import StepMark, StepState
-from recording.reading.session import Session
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.recording.reading.session import Session
 
 BAND_K = 0.5  # the air is at its set-point: five digits of the regulator's display
 

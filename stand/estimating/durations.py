@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-from drivers.devices.motion.stage import AxisSettings
-from drivers.devices.motion.stage_profiles import StageProfile
-from experiments.steps import KnownStand, Price, Situation, Step
-from foundation.errors import ConfigError
-from stand.config.stand_config import StandConfig
-from stand.estimating.camera_lines import overloaded
-from stand.estimating.chamber_model import ChamberModel
+from thermostand.drivers.devices.motion.stage import AxisSettings
+from thermostand.drivers.devices.motion.stage_profiles import StageProfile
+from thermostand.experiments.steps import KnownStand, Price, Situation, Step
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.camera_lines import overloaded
+from thermostand.stand.estimating.chamber_model import ChamberModel
 
 
 def move_s(stage: StageProfile, steps: float) -> float:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     COOL_DOWN_AS_FOUND,
     AnySoak,
     Capture,
@@ -21,11 +21,11 @@ from experiments.steps import (
     StartChamber,
     Step,
 )
-from foundation.errors import ConfigError
-from stand.config.stand_config import StandConfig
-from stand.estimating.chamber_model import ChamberModel
-from stand.estimating.durations import ConfiguredStand, expect
-from stand.estimating.learned import Learned
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.chamber_model import ChamberModel
+from thermostand.stand.estimating.durations import ConfiguredStand, expect
+from thermostand.stand.estimating.learned import Learned
 
 # Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
 # with its share of the index, committed every second.

@@ -10,12 +10,12 @@ from statistics import median_low
 from types import MappingProxyType
 from typing import Any, cast
 
-from experiments.steps import KnownStand, Situation, number_steps, step_of
-from foundation.clock import NS_PER_S
-from foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, PLAN_CHANGED, SOAK_LONGER, TO_AMBIENT
-from foundation.items import Event, StepMark, StepState
-from stand.estimating.estimate import PricedStep
-from stand.gate import HELD, RELEASED
+from thermostand.experiments.steps import KnownStand, Situation, number_steps, step_of
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, PLAN_CHANGED, SOAK_LONGER, TO_AMBIENT
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.stand.estimating.estimate import PricedStep
+from thermostand.stand.gate import HELD, RELEASED
 
 _REMEMBERED = 9  # the last measurements of a kind of work count
 _LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is

@@ -11,17 +11,17 @@ from statistics import median
 
 from pydantic import Field
 
-from experiments.steps import Situation, Step, step_of
-from foundation.clock import NS_PER_S
-from foundation.documents import Document, yaml_data
-from foundation.errors import ConfigError, SessionError
-from foundation.files import replace_file
-from foundation.items import StepMark, StepState
-from foundation.sealed import seal, unseal
-from recording.reading.session import Session
-from stand.config.stand_config import StandConfig
-from stand.estimating.chamber_model import ChamberModel, Ramp, fit, ramps_of
-from stand.estimating.durations import ConfiguredStand, expect
+from thermostand.experiments.steps import Situation, Step, step_of
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.documents import Document, yaml_data
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.files import replace_file
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.foundation.sealed import seal, unseal
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.chamber_model import ChamberModel, Ramp, fit, ramps_of
+from thermostand.stand.estimating.durations import ConfiguredStand, expect
 
 LEARNED_FILE = "learned.json"
 _KIND = "learned"

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.steps import PlannedStep
-from stand.config.stand_config import StandConfig
-from stand.estimating.estimate import PricedStep, price, way_back_s
-from stand.estimating.learned import load_learned
+from thermostand.experiments.steps import PlannedStep
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.estimate import PricedStep, price, way_back_s
+from thermostand.stand.estimating.learned import load_learned
 
 
 @dataclass(frozen=True, slots=True)

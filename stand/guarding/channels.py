@@ -14,15 +14,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from statistics import median
 
-from foundation.clock import NS_PER_S
-from foundation.events import SENSOR, SENSOR_BELIEVED, guard_kind, guard_rule
-from foundation.items import Event
-from foundation.readings import Quality, Reading
-from stand.config.chamber_section import FrozenConfig
-from stand.config.guard_section import SensorsConfig
-from stand.fault import Fault
-from stand.guarding.interlocks import SENSOR_STALE
-from stand.guarding.plausibility import SENSOR_STUCK
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import SENSOR, SENSOR_BELIEVED, guard_kind, guard_rule
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.stand.config.chamber_section import FrozenConfig
+from thermostand.stand.config.guard_section import SensorsConfig
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.interlocks import SENSOR_STALE
+from thermostand.stand.guarding.plausibility import SENSOR_STUCK
 
 SENSOR_JUMPED = guard_rule("sensor_jumped", "a temperature jumped by more than a body can", SENSOR)
 SENSOR_OUTSIDE = guard_rule("sensor_outside", "a temperature is where it cannot be", SENSOR)

@@ -8,12 +8,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.events import SENSOR, guard_rule
-from stand.fault import Fault, Readings, value_of
-from stand.guarding.interlocks import Rule
-from stand.guarding.plausibility import remembering
-from stand.guarding.suspects import Suspicion
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.events import SENSOR, guard_rule
+from thermostand.stand.fault import Fault, Readings, value_of
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.plausibility import remembering
+from thermostand.stand.guarding.suspects import Suspicion
 
 SENSOR_DRIFTS = guard_rule("sensor_drifts", "two sensors of the same air drift apart while it is at rest", SENSOR)
 _NEAR_K = 1.0  # of the set-point, or it is not held

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.events import guard_rule
-from stand.config.chamber_section import CameraFeelsConfig, GraniteFeelsConfig
-from stand.fault import Fault, Readings, value_of
-from stand.guarding.interlocks import Rule
-from stand.guarding.plausibility import remembering
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.events import guard_rule
+from thermostand.stand.config.chamber_section import CameraFeelsConfig, GraniteFeelsConfig
+from thermostand.stand.fault import Fault, Readings, value_of
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.plausibility import remembering
 
 AIR_WARMER_THAN_SHOWN = guard_rule(
     "air_warmer_than_shown", "a body in the chamber warms as if the air were warmer than shown"

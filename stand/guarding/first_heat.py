@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from foundation.clock import seconds_ns
-from foundation.events import guard_rule
-from stand.config.chamber_section import FirstHeatConfig
-from stand.fault import Fault, Readings, value_of
-from stand.guarding.heat_given import heat_percent
-from stand.guarding.interlocks import Rule
-from stand.guarding.plausibility import remembering
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.events import guard_rule
+from thermostand.stand.config.chamber_section import FirstHeatConfig
+from thermostand.stand.fault import Fault, Readings, value_of
+from thermostand.stand.guarding.heat_given import heat_percent
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.plausibility import remembering
 
 FIRST_HEAT = guard_rule("first_heat", "the first heat is not felt where it is given")
 _LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds

@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from foundation.clock import seconds_ns
-from foundation.events import guard_rule
-from stand.fault import Fault, Readings, value_of
-from stand.guarding.interlocks import Rule
-from stand.guarding.plausibility import remembering
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.events import guard_rule
+from thermostand.stand.fault import Fault, Readings, value_of
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.plausibility import remembering
 
 SENSOR_FROZEN = guard_rule("sensor_frozen", "a temperature has not moved at all while the regulator's output works")
 

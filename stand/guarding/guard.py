@@ -10,15 +10,15 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.errors import DeviceError
-from foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, NOTIFY_FAILED, guard_rule
-from foundation.hub import Hub
-from stand.fault import Fault
-from stand.guarding.interlocks import NOT_RECORDED, Watch
-from stand.guarding.met_errors import MetErrors
-from stand.guarding.notify import Notifier
-from stand.safety import Safety
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError
+from thermostand.foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, NOTIFY_FAILED, guard_rule
+from thermostand.foundation.hub import Hub
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.interlocks import NOT_RECORDED, Watch
+from thermostand.stand.guarding.met_errors import MetErrors
+from thermostand.stand.guarding.notify import Notifier
+from thermostand.stand.safety import Safety
 
 _GUARD_FAILED = guard_rule("guard_failed", "the guard itself has failed")
 LATE_PERIODS = 2

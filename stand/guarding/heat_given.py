@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.events import guard_rule
-from stand.config.chamber_section import ChamberConfig, HeatFeltConfig
-from stand.fault import Fault, Readings, value_of
-from stand.guarding.interlocks import Rule
-from stand.guarding.plausibility import remembering
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.events import guard_rule
+from thermostand.stand.config.chamber_section import ChamberConfig, HeatFeltConfig
+from thermostand.stand.fault import Fault, Readings, value_of
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.plausibility import remembering
 
 HEAT_NOT_FELT = guard_rule("heat_not_felt", "the regulator heats hard, and a probe does not show it")
 TOO_MUCH_HEAT = guard_rule("too_much_heat", "more heat was given within an hour than the chamber ever needs")

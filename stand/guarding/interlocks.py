@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.events import CONNECTED, SENSOR, guard_rule
-from foundation.readings import Quality
-from stand.fault import Action, Fault, Readings, value_of
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.events import CONNECTED, SENSOR, guard_rule
+from thermostand.foundation.readings import Quality
+from thermostand.stand.fault import Action, Fault, Readings, value_of
 
 OVER_TEMPERATURE = guard_rule("over_temperature", "a temperature is above its limit")
 SENSOR_MISSING = guard_rule("sensor_missing", "a temperature that heat depends on was never read", CONNECTED)

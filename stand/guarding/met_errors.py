@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from foundation.errors import DeviceAlarm, DeviceError, GarbledReply, Unreachable
-from foundation.events import guard_rule
-from foundation.items import Batch, Item
-from foundation.readings import Quality
-from stand.fault import Fault, Readings
-from stand.guarding.interlocks import DEVICE_FAULT, STAGE_ALARM, Watch
+from thermostand.foundation.errors import DeviceAlarm, DeviceError, GarbledReply, Unreachable
+from thermostand.foundation.events import guard_rule
+from thermostand.foundation.items import Batch, Item
+from thermostand.foundation.readings import Quality
+from thermostand.stand.fault import Fault, Readings
+from thermostand.stand.guarding.interlocks import DEVICE_FAULT, STAGE_ALARM, Watch
 
 DEVICE_LOST = guard_rule("device_lost", "a step met a device that does not answer")
 

@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from foundation.clock import seconds_ns
-from foundation.events import guard_rule
-from stand.config.chamber_section import NeededOutputConfig
-from stand.fault import Fault, Readings, value_of
-from stand.guarding.heat_given import heat_percent
-from stand.guarding.interlocks import Rule
-from stand.guarding.plausibility import remembering
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.events import guard_rule
+from thermostand.stand.config.chamber_section import NeededOutputConfig
+from thermostand.stand.fault import Fault, Readings, value_of
+from thermostand.stand.guarding.heat_given import heat_percent
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.plausibility import remembering
 
 OUTPUT_NOT_AS_NEEDED = guard_rule(
     "output_not_as_needed", "the regulator needs another output than before for the same set-point"

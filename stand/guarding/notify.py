@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from threading import Lock
 
-from foundation.calls import Lane
-from foundation.clock import Clock
-from foundation.helper import Helper
-from stand.guarding.notify_process import KILLED_LIMIT_S, MODULE, run_command
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.helper import Helper
+from thermostand.stand.guarding.notify_process import KILLED_LIMIT_S, MODULE, run_command
 
 _LINES = ("tell-1", "tell-2", "tell-3")  # so many commands at once: a slow one delays no other
 _SPARE_S = 4.0  # real seconds beyond what the command may take, for a machine that is busy

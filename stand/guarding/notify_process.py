@@ -13,7 +13,7 @@ import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
 
-MODULE = "stand.guarding.notify_process"
+MODULE = "thermostand.stand.guarding.notify_process"
 LEFT_NAME = "stand-tell-left"  # of a process whose daemon has gone
 KILLED_LIMIT_S = 1.0  # real seconds for what was killed to be gone
 

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.events import SENSOR, guard_rule
-from foundation.readings import Reading
-from stand.config.guard_section import CoolingConfig, HeaterOffConfig, HeatingConfig
-from stand.fault import Fault, Readings, in_doubt, value_of
-from stand.guarding.interlocks import Rule
-from stand.guarding.surroundings import Surroundings
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.events import SENSOR, guard_rule
+from thermostand.foundation.readings import Reading
+from thermostand.stand.config.guard_section import CoolingConfig, HeaterOffConfig, HeatingConfig
+from thermostand.stand.fault import Fault, Readings, in_doubt, value_of
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.surroundings import Surroundings
 
 HEATER_NOT_WARMING = guard_rule("heater_not_warming", "heat is given and the air does not warm")
 WARMING_WHILE_OFF = guard_rule("warming_while_off", "the air warms though nothing heats")

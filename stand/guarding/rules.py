@@ -6,21 +6,21 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
-from experiments.steps import Capture
-from foundation.events import FRAMES_RESUMED, FRAMES_STOPPED
-from foundation.items import Event, Item, StepMark, StepState
-from stand.config.dew import dew_point_degC
-from stand.config.stand_config import StandConfig
-from stand.fault import Action, Readings, value_of
-from stand.gate import HELD, OPERATOR, RELEASED
-from stand.guarding.channels import LEAST_LAG_S, Nature
-from stand.guarding.drifting import drifting
-from stand.guarding.felt_air import camera_feels, granite_feels
-from stand.guarding.first_heat import first_heat
-from stand.guarding.frozen import frozen
-from stand.guarding.heat_given import heat_not_felt, too_much_heat
-from stand.guarding.interlocks import (
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.events import FRAMES_RESUMED, FRAMES_STOPPED
+from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.stand.config.dew import dew_point_degC
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.fault import Action, Readings, value_of
+from thermostand.stand.gate import HELD, OPERATOR, RELEASED
+from thermostand.stand.guarding.channels import LEAST_LAG_S, Nature
+from thermostand.stand.guarding.drifting import drifting
+from thermostand.stand.guarding.felt_air import camera_feels, granite_feels
+from thermostand.stand.guarding.first_heat import first_heat
+from thermostand.stand.guarding.frozen import frozen
+from thermostand.stand.guarding.heat_given import heat_not_felt, too_much_heat
+from thermostand.stand.guarding.interlocks import (
     Recording,
     Rule,
     Watch,
@@ -42,15 +42,15 @@ from stand.guarding.interlocks import (
     stopped_while_permitted,
     trustworthy,
 )
-from stand.guarding.needed_output import output_not_as_needed
-from stand.guarding.plausibility import (
+from thermostand.stand.guarding.needed_output import output_not_as_needed
+from thermostand.stand.guarding.plausibility import (
     cooling_in_vain,
     heater_not_warming,
     stuck_while_other_moves,
     warming_while_off,
 )
-from stand.guarding.surroundings import Following, Surroundings, measured, together
-from stand.guarding.suspects import Witnesses, telling
+from thermostand.stand.guarding.surroundings import Following, Surroundings, measured, together
+from thermostand.stand.guarding.suspects import Witnesses, telling
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",

@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from foundation.clock import NS_PER_S
-from stand.fault import Readings, value_of
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.fault import Readings, value_of
 
 Surroundings = Callable[[Readings, int], tuple[float, ...]]  # degC at an instant, NaN what is not known
 

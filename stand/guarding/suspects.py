@@ -12,11 +12,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from foundation.clock import NS_PER_S
-from stand.config.chamber_section import ChamberConfig
-from stand.fault import Fault, Readings, in_doubt, value_of
-from stand.guarding.heat_given import heat_percent
-from stand.guarding.interlocks import Rule
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.config.chamber_section import ChamberConfig
+from thermostand.stand.fault import Fault, Readings, in_doubt, value_of
+from thermostand.stand.guarding.heat_given import heat_percent
+from thermostand.stand.guarding.interlocks import Rule
 
 _EVERY_S, _KEPT_S = 10.0, 3600.0
 _BEFORE_S = 300.0  # from which a body's own trend is taken

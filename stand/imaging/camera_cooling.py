@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.events import COOL_DOWN_UNSURE, COOLED_DOWN
-from foundation.hub import Hub
-from foundation.readings import Quality, Reading
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.events import COOL_DOWN_UNSURE, COOLED_DOWN
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Quality, Reading
 
 _LOOK_S = 10.0
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError, Unreachable
-from foundation.events import CAMERA_BACK
-from foundation.hub import Hub
-from foundation.items import Batch, Item
-from stand.imaging.cameras import Cameras
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError, Unreachable
+from thermostand.foundation.events import CAMERA_BACK
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Item
+from thermostand.stand.imaging.cameras import Cameras
 
 LOST_LIMIT_S = 1800.0
 RETRY_S, LONGEST_RETRY_S = 1.0, 10.0

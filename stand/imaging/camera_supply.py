@@ -7,20 +7,20 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from drivers.devices.protocols import Switches
-from drivers.devices.relays import CAMERA_POWER
-from drivers.settings import EquilibriumSettings
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError, Unreachable
-from foundation.events import CAMERA_SUPPLY_OFF
-from foundation.hub import Hub
-from foundation.tasks import cancelled
-from stand.gate import CAMERA_LOST, Gate
-from stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
-from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
-from stand.imaging.cameras import Cameras
-from stand.imaging.equilibrium import CAMERA, CameraEquilibrium
-from stand.interlock import Interlock
+from thermostand.drivers.devices.protocols import Switches
+from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.drivers.settings import EquilibriumSettings
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError, Unreachable
+from thermostand.foundation.events import CAMERA_SUPPLY_OFF
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.tasks import cancelled
+from thermostand.stand.gate import CAMERA_LOST, Gate
+from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
+from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
+from thermostand.stand.imaging.cameras import Cameras
+from thermostand.stand.imaging.equilibrium import CAMERA, CameraEquilibrium
+from thermostand.stand.interlock import Interlock
 
 _BOOT_LIMIT_S = 60.0
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Coroutine, Mapping
 
-from drivers.devices.protocols import Camera
-from drivers.settings import identity_event
-from foundation.errors import ConfigError
-from foundation.items import Event
+from thermostand.drivers.devices.protocols import Camera
+from thermostand.drivers.settings import identity_event
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.items import Event
 
 
 class Cameras:

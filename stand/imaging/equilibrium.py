@@ -13,13 +13,18 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from drivers.settings import EquilibriumSettings
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LATE, CAMERA_EQUILIBRIUM_LOST, EventKind
-from foundation.hub import Hub
-from foundation.items import Batch, Item
-from foundation.readings import Quality
-from stand.imaging.settling import Float, camera_rate, digit_K, seconds
+from thermostand.drivers.settings import EquilibriumSettings
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.events import (
+    CAMERA_EQUILIBRIUM,
+    CAMERA_EQUILIBRIUM_LATE,
+    CAMERA_EQUILIBRIUM_LOST,
+    EventKind,
+)
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Item
+from thermostand.foundation.readings import Quality
+from thermostand.stand.imaging.settling import Float, camera_rate, digit_K, seconds
 
 CAMERA = "camera.temperature"
 _TIME_CONSTANTS = 5.0

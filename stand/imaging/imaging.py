@@ -7,18 +7,18 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 
-from drivers.devices.protocols import Camera, Shutter
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import Unreachable
-from foundation.events import CAMERA_BACK, CAMERA_LOST
-from foundation.hub import Hub
-from foundation.readings import TEMPERATURE_IN_DOUBT, Frame
-from stand import gate as reasons
-from stand.config.stand_config import LEADING
-from stand.gate import Gate
-from stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
-from stand.imaging.camera_supply import CameraSupply
-from stand.interlock import Interlock, Motions
+from thermostand.drivers.devices.protocols import Camera, Shutter
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import Unreachable
+from thermostand.foundation.events import CAMERA_BACK, CAMERA_LOST
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, Frame
+from thermostand.stand import gate as reasons
+from thermostand.stand.config.stand_config import LEADING
+from thermostand.stand.gate import Gate
+from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
+from thermostand.stand.imaging.camera_supply import CameraSupply
+from thermostand.stand.interlock import Interlock, Motions
 
 _APART_S = 0.001  # between two cameras' frames: an image and its description are found by their instant
 

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.steps import SoakUntilSettled
-from foundation.clock import NS_PER_S
-from stand.estimating.chamber_model import BAND_K
+from thermostand.experiments.steps import SoakUntilSettled
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.estimating.chamber_model import BAND_K
 
 if TYPE_CHECKING:
-    from markers.detection import Detection
+    from thermostand.markers.detection import Detection
 
 Float = NDArray[np.float64]
 

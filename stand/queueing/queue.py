@@ -10,19 +10,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from foundation.errors import SessionError, StandTripped
-from foundation.files import make_folder
-from stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
+from thermostand.foundation.errors import SessionError, StandTripped
+from thermostand.foundation.files import make_folder
+from thermostand.stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
 
 if TYPE_CHECKING:
-    from stand.running.order import Order
+    from thermostand.stand.running.order import Order
 
 
 def order_of(entry: Entry) -> Order:
     """What an entry asks for; ConfigError when this version of the program refuses it."""
     # The process that touches the disk for a daemon loads this module, and needs none of that.
-    from stand.estimating.estimate import price
-    from stand.running.order import parse_order, with_register_maps
+    from thermostand.stand.estimating.estimate import price
+    from thermostand.stand.running.order import parse_order, with_register_maps
 
     texts = {"config.yaml": entry.config_text, "recipe.yaml": entry.recipe_text, "target.yaml": entry.target_text}
     names = {"config.yaml": entry.config, "recipe.yaml": entry.recipe, "target.yaml": "its target"}

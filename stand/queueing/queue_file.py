@@ -18,11 +18,11 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from foundation.document_faults import path_text
-from foundation.documents import Document
-from foundation.errors import NotThere, SessionError
-from foundation.files import replace_file
-from foundation.sealed import seal, unseal
+from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import NotThere, SessionError
+from thermostand.foundation.files import replace_file
+from thermostand.foundation.sealed import seal, unseal
 
 QUEUE_NAME = "queue.json"
 LAST_NAME = "queue.json.last"

@@ -6,22 +6,22 @@ import asyncio
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from foundation.errors import ConfigError, Interrupted, SessionError, StandError, StandTripped
-from foundation.events import NOT_CONFIRMED_SAFE
-from foundation.hub import Hub
-from foundation.items import Event, Item, StepMark, StepState
-from stand.config.stand_config import StandConfig
-from stand.estimating.learned import learn
-from stand.estimating.run_estimate import price_night
-from stand.queueing.queue import order_of
-from stand.queueing.queue_file import Entry
-from stand.queueing.queue_work import Halt, Notes
-from stand.running.memory.entries import Ended
-from stand.running.memory.journal import Journal
-from stand.running.resume import Interruption, interruption, is_of_virtual_time
-from stand.running.run import resume, run_real, run_virtual
-from stand.running.session_report import NotReported, check_reportable, report_session
-from stand.watching.live import followed
+from thermostand.foundation.errors import ConfigError, Interrupted, SessionError, StandError, StandTripped
+from thermostand.foundation.events import NOT_CONFIRMED_SAFE
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.learned import learn
+from thermostand.stand.estimating.run_estimate import price_night
+from thermostand.stand.queueing.queue import order_of
+from thermostand.stand.queueing.queue_file import Entry
+from thermostand.stand.queueing.queue_work import Halt, Notes
+from thermostand.stand.running.memory.entries import Ended
+from thermostand.stand.running.memory.journal import Journal
+from thermostand.stand.running.resume import Interruption, interruption, is_of_virtual_time
+from thermostand.stand.running.run import resume, run_real, run_virtual
+from thermostand.stand.running.session_report import NotReported, check_reportable, report_session
+from thermostand.stand.watching.live import followed
 
 
 async def run_entry(directory: Path, entry: Entry, notes: Notes, *, virtual_time: bool) -> Path:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from foundation.clock import Now, WallClock
-from foundation.errors import DeviceError, Interrupted, InUse, SessionError, StandError, StandTripped
-from foundation.patience import Patience
-from recording.writing.disk import QUEUE_LINE, Disk, DiskCalls
-from stand.queueing.queue import finish, note_session, note_step, queued, take
-from stand.queueing.queue_file import Entry, State, working
+from thermostand.foundation.clock import Now, WallClock
+from thermostand.foundation.errors import DeviceError, Interrupted, InUse, SessionError, StandError, StandTripped
+from thermostand.foundation.patience import Patience
+from thermostand.recording.writing.disk import QUEUE_LINE, Disk, DiskCalls
+from thermostand.stand.queueing.queue import finish, note_session, note_step, queued, take
+from thermostand.stand.queueing.queue_file import Entry, State, working
 
 MOST_FRUITLESS_STARTS = 3
 _NOTED_WITHIN_S = 1.0  # real seconds that a disk may take for the note of a run's end; it is written later, then

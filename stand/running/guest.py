@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from foundation.calls import Lane
-from foundation.clock import VirtualClock, boot_of, utc_offset_ns
-from foundation.documents import parse_document
-from foundation.errors import NotCleared, StandError, StandTripped
-from foundation.events import (
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import VirtualClock, boot_of, utc_offset_ns
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import NotCleared, StandError, StandTripped
+from thermostand.foundation.events import (
     CLEARED,
     FRAMES_RESUMED,
     FRAMES_STOPPED,
@@ -26,37 +26,37 @@ from foundation.events import (
     TELEMETRY_NOT_SAVED,
     TELEMETRY_SAVED_AGAIN,
 )
-from foundation.hub import Hub
-from foundation.instants import duration, local_text
-from foundation.items import Event, Item
-from foundation.tasks import cause_of, failure_text, watched
-from markers.target import Target
-from recording.reading.run_word import Run
-from recording.writing.disk import NOTES_LINE, DiskCalls
-from recording.writing.recorder import Recorder
-from stand.assembly import Assembly
-from stand.estimating.run_estimate import price_night
-from stand.fault import Fault
-from stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
-from stand.running.executing.camera_gap import OffsetGap, OffsetWatch, doubt
-from stand.running.executing.deciding import Decider
-from stand.running.executing.executor import Executor
-from stand.running.executing.settling_watch import SettlingWatch, load_for
-from stand.running.memory.entries import Cleared, Ended, Gap, Written
-from stand.running.memory.fold import fold
-from stand.running.memory.journal import Journal, Logbook
-from stand.running.opening.holds import end_endless_holds
-from stand.running.opening.open_stand import OpenStand
-from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
-from stand.running.opening.to_ambient import to_ambient
-from stand.running.order import Order, check_plan
-from stand.running.resume import Interruption, begun, plan_hash
-from stand.running.run_desk import RunDesk
-from stand.running.session_report import DECIDES
-from stand.running.status import StatusBoard
-from stand.serving.api.doors import Interface
-from stand.serving.api.server import preload, serve
-from stand.serving.eta_slip import EtaSlip
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.instants import duration, local_text
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.tasks import cause_of, failure_text, watched
+from thermostand.markers.target import Target
+from thermostand.recording.reading.run_word import Run
+from thermostand.recording.writing.disk import NOTES_LINE, DiskCalls
+from thermostand.recording.writing.recorder import Recorder
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.estimating.run_estimate import price_night
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
+from thermostand.stand.running.executing.camera_gap import OffsetGap, OffsetWatch, doubt
+from thermostand.stand.running.executing.deciding import Decider
+from thermostand.stand.running.executing.executor import Executor
+from thermostand.stand.running.executing.settling_watch import SettlingWatch, load_for
+from thermostand.stand.running.memory.entries import Cleared, Ended, Gap, Written
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.memory.journal import Journal, Logbook
+from thermostand.stand.running.opening.holds import end_endless_holds
+from thermostand.stand.running.opening.open_stand import OpenStand
+from thermostand.stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
+from thermostand.stand.running.opening.to_ambient import to_ambient
+from thermostand.stand.running.order import Order, check_plan
+from thermostand.stand.running.resume import Interruption, begun, plan_hash
+from thermostand.stand.running.run_desk import RunDesk
+from thermostand.stand.running.session_report import DECIDES
+from thermostand.stand.running.status import StatusBoard
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.server import preload, serve
+from thermostand.stand.serving.eta_slip import EtaSlip
 
 # The recorder's events that hold a run, and those that let it continue.
 _HOLDING: dict[str, str] = {FRAMES_STOPPED: DISK_LOW, TELEMETRY_NOT_SAVED: NOT_RECORDED}

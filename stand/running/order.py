@@ -5,22 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivers.settings import OnBus
-from drivers.wires.bus import Bus
-from experiments.sequence import faults
-from experiments.steps import PlannedStep
-from experiments.written import Written
-from foundation.clock import WallClock
-from foundation.documents import parse_document, read_document
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from markers.target import Target
-from stand.assembly import bus_units, inputs_of
-from stand.config.checked import ATTACHMENT, load_checked
-from stand.config.recipe import Recipe
-from stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
-from stand.estimating.durations import ConfiguredStand
-from stand.estimating.estimate import check_step, price
+from thermostand.drivers.settings import OnBus
+from thermostand.drivers.wires.bus import Bus
+from thermostand.experiments.sequence import faults
+from thermostand.experiments.steps import PlannedStep
+from thermostand.experiments.written import Written
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.documents import parse_document, read_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.markers.target import Target
+from thermostand.stand.assembly import bus_units, inputs_of
+from thermostand.stand.config.checked import ATTACHMENT, load_checked
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
+from thermostand.stand.estimating.durations import ConfiguredStand
+from thermostand.stand.estimating.estimate import check_step, price
 
 _REGISTERS, _OPTICS = "registers-{}.yaml", "optics-{}.yaml"  # their names in a session
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from experiments.steps import STEPS, PlannedStep, Situation, Step, step_of
-from foundation.errors import ConfigError
-from stand.config.stand_config import StandConfig
-from stand.estimating.estimate import price
-from stand.running.memory.entries import edited
-from stand.running.memory.fold import after, refusal
-from stand.running.memory.state import RunState
-from stand.running.order import plan_faults
-from stand.serving.desk import WrittenStep
-from stand.serving.plan_faults import PlanCheck, StepFault
+from thermostand.experiments.steps import STEPS, PlannedStep, Situation, Step, step_of
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.estimating.estimate import price
+from thermostand.stand.running.memory.entries import edited
+from thermostand.stand.running.memory.fold import after, refusal
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.order import plan_faults
+from thermostand.stand.serving.desk import WrittenStep
+from thermostand.stand.serving.plan_faults import PlanCheck, StepFault
 
 _SET_POINT = "chamber_degC"
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import yaml
 
-from drivers.devices.motion.flap import FlapSettings
-from drivers.settings import CameraSettings, OnBus
-from foundation.errors import ConfigError
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.order import Order, with_register_maps
+from thermostand.drivers.devices.motion.flap import FlapSettings
+from thermostand.drivers.settings import CameraSettings, OnBus
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.running.order import Order, with_register_maps
 
 _FOUND_BY = {"address", "width_px", "height_px"}  # of a camera: where it is, and what the simulated sensor may not have
 _HEAD = "# A rehearsal of this stand's file: the simulated laboratory in the place of its devices.\n"

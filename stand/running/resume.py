@@ -15,26 +15,36 @@ from heapq import merge
 from operator import attrgetter
 from pathlib import Path
 
-from experiments.steps import Capture, PlannedStep
-from foundation.errors import SessionError
-from foundation.events import PLAN_CHANGED, RUN_BEGINS, RUN_END
-from foundation.items import Event, Item, StepMark, StepState
-from foundation.progress import late_progress
-from recording.format.restarts import frames_lost_of, restarted_step
-from recording.reading.glance import glance
-from recording.reading.run_word import Run, last_run_event
-from recording.reading.session import Session
-from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
-from recording.writing.recorder_settings import SessionInfo
-from stand.config.stand_config import StandConfig
-from stand.running.executing.actions import cold_start
-from stand.running.executing.camera_gap import CameraBefore, camera_before
-from stand.running.memory.entries import Again, Begun, Ended, Entry, Step, Taken, Tripped, Written, change_of
-from stand.running.memory.fold import after, fold
-from stand.running.memory.journal import JOURNAL_NAME, Journal
-from stand.running.memory.state import RunState
-from stand.running.opening.own_stand import Difference, default_stand, on_this_stand
-from stand.running.order import Order, parse_order
+from thermostand.experiments.steps import Capture, PlannedStep
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import PLAN_CHANGED, RUN_BEGINS, RUN_END
+from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.foundation.progress import late_progress
+from thermostand.recording.format.restarts import frames_lost_of, restarted_step
+from thermostand.recording.reading.glance import glance
+from thermostand.recording.reading.run_word import Run, last_run_event
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
+from thermostand.recording.writing.recorder_settings import SessionInfo
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.executing.actions import cold_start
+from thermostand.stand.running.executing.camera_gap import CameraBefore, camera_before
+from thermostand.stand.running.memory.entries import (
+    Again,
+    Begun,
+    Ended,
+    Entry,
+    Step,
+    Taken,
+    Tripped,
+    Written,
+    change_of,
+)
+from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.opening.own_stand import Difference, default_stand, on_this_stand
+from thermostand.stand.running.order import Order, parse_order
 
 
 def begun(order: Order, run: str, time_ns: int, seed: int | None) -> Begun:

@@ -9,36 +9,42 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
-from foundation.errors import Interrupted, SessionError, StandError, StandTripped
-from foundation.events import JOURNAL_DAMAGED, LIMITS_ACCEPTED, NOTIFY_FAILED, SALVAGED, STAND_DIFFERS
-from foundation.hub import Hub
-from foundation.instants import utc_text
-from foundation.items import Event, Item
-from foundation.progress import late_progress
-from foundation.repeats import RepeatLimit
-from foundation.tasks import cancelled, cause_of, failure_text
-from recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
-from recording.writing.disk import REPAIR_LINE, Disk, DiskCalls
-from recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
-from recording.writing.recorder_settings import SessionInfo
-from stand.assembly import Assembly, assemble
-from stand.config.safe_ranges import accepted_text
-from stand.running.guest import Guest, Job
-from stand.running.opening.claim import claimed
-from stand.running.opening.clock_watch import ClockWatch
-from stand.running.opening.one_cpu import one_cpu
-from stand.running.opening.open_stand import OpenStand, Time, opened
-from stand.running.opening.stand_latch import StandLatch
-from stand.running.opening.stop import Stop
-from stand.running.opening.temperature_check import check_temperature
-from stand.running.opening.writer_restarts import WriterRestarts
-from stand.running.order import Order
-from stand.running.rehearsal import rehearsed
-from stand.running.resume import Interruption, interruption, is_of_virtual_time
-from stand.running.session_files import camera_serials, info_of, recorder_of, session_directory, tell_identities
-from stand.serving.alerts import alerting
-from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
+from thermostand.foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
+from thermostand.foundation.errors import Interrupted, SessionError, StandError, StandTripped
+from thermostand.foundation.events import JOURNAL_DAMAGED, LIMITS_ACCEPTED, NOTIFY_FAILED, SALVAGED, STAND_DIFFERS
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.instants import utc_text
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.progress import late_progress
+from thermostand.foundation.repeats import RepeatLimit
+from thermostand.foundation.tasks import cancelled, cause_of, failure_text
+from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
+from thermostand.recording.writing.disk import REPAIR_LINE, Disk, DiskCalls
+from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
+from thermostand.recording.writing.recorder_settings import SessionInfo
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.config.safe_ranges import accepted_text
+from thermostand.stand.running.guest import Guest, Job
+from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.opening.clock_watch import ClockWatch
+from thermostand.stand.running.opening.one_cpu import one_cpu
+from thermostand.stand.running.opening.open_stand import OpenStand, Time, opened
+from thermostand.stand.running.opening.stand_latch import StandLatch
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.running.opening.temperature_check import check_temperature
+from thermostand.stand.running.opening.writer_restarts import WriterRestarts
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.rehearsal import rehearsed
+from thermostand.stand.running.resume import Interruption, interruption, is_of_virtual_time
+from thermostand.stand.running.session_files import (
+    camera_serials,
+    info_of,
+    recorder_of,
+    session_directory,
+    tell_identities,
+)
+from thermostand.stand.serving.alerts import alerting
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
 __all__ = ["Interrupted", "resume", "run_in", "run_real", "run_virtual"]
 

@@ -8,26 +8,26 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from experiments.steps import PlannedStep, Step
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.errors import ConfigError, SessionError
-from foundation.events import PROMPT
-from foundation.items import Event, Item, StepMark, StepState
-from recording.writing.disk import DiskCalls
-from stand.assembly import Assembly, device_kinds
-from stand.estimating.eta import Eta
-from stand.fault import Fault
-from stand.gate import INTERLOCK, OPERATOR, Phase
-from stand.running.executing.executor import Executor
-from stand.running.memory.journal import Logbook
-from stand.running.memory.state import RunState
-from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
-from stand.running.plan_check import check_edit, steps_of
-from stand.running.said import Said, keep
-from stand.running.simulated_faults import break_or_mend, simulated_faults
-from stand.running.status import STATES
-from stand.serving.command_event import command_event
-from stand.serving.desk import (
+from thermostand.experiments.steps import PlannedStep, Step
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.events import PROMPT
+from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.recording.writing.disk import DiskCalls
+from thermostand.stand.assembly import Assembly, device_kinds
+from thermostand.stand.estimating.eta import Eta
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import INTERLOCK, OPERATOR, Phase
+from thermostand.stand.running.executing.executor import Executor
+from thermostand.stand.running.memory.journal import Logbook
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
+from thermostand.stand.running.plan_check import check_edit, steps_of
+from thermostand.stand.running.said import Said, keep
+from thermostand.stand.running.simulated_faults import break_or_mend, simulated_faults
+from thermostand.stand.running.status import STATES
+from thermostand.stand.serving.command_event import command_event
+from thermostand.stand.serving.desk import (
     Conflict,
     DeviceState,
     Done,
@@ -47,8 +47,8 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.plan_faults import PlanCheck
-from stand.serving.seen import seen_state
+from thermostand.stand.serving.plan_faults import PlanCheck
+from thermostand.stand.serving.seen import seen_state
 
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"
 _ENDING = (Phase.ABORTING, Phase.ENDING, Phase.ENDED)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from foundation.clock import Clock
-from foundation.errors import ConfigError
-from foundation.events import NOTE
-from foundation.hub import Hub
-from recording.reading.notes import add_note, add_tags, check_tag
-from recording.writing.disk import DiskCalls
-from stand.serving.desk import Who
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.events import NOTE
+from thermostand.foundation.hub import Hub
+from thermostand.recording.reading.notes import add_note, add_tags, check_tag
+from thermostand.recording.writing.disk import DiskCalls
+from thermostand.stand.serving.desk import Who
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,21 +11,21 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from drivers.settings import identity_event
-from foundation.clock import NS_PER_S, Clock, VirtualClock
-from foundation.documents import parse_document
-from foundation.events import ABSENT, SEARCH_FAILED
-from foundation.hub import Hub
-from foundation.items import Event
-from markers.target import Target
-from recording.format.roi import RoiEncoder
-from recording.writing.disk import Disk
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
-from recording.writing.recorder_settings import VIRTUAL_COMMIT_S
-from stand.assembly import Assembly, device_kinds
-from stand.config.stand_config import RecordingConfig, StandConfig
-from stand.estimating.absent import absences
-from stand.running.order import Order
+from thermostand.drivers.settings import identity_event
+from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.events import ABSENT, SEARCH_FAILED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.markers.target import Target
+from thermostand.recording.format.roi import RoiEncoder
+from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
+from thermostand.stand.assembly import Assembly, device_kinds
+from thermostand.stand.config.stand_config import RecordingConfig, StandConfig
+from thermostand.stand.estimating.absent import absences
+from thermostand.stand.running.order import Order
 
 
 def session_directory(out: Path, order: Order, clock: Clock) -> Path:
@@ -116,6 +116,8 @@ def _partial_frames(order: Order) -> RoiEncoder | None:
     if recording.frame_encoding != "roi":
         return None
     target = parse_document(order.target_text, Target, order.config.target)
-    from markers.windows import marker_windows  # scipy takes half a second that other runs need not wait for
+    from thermostand.markers.windows import (
+        marker_windows,
+    )  # scipy takes half a second that other runs need not wait for
 
     return RoiEncoder(partial(marker_windows, target=target), recording.whole_every_s)

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from compensation.design import process
-from experiments.steps import Capture, PlannedStep
-from foundation.errors import ConfigError, StandError
-from foundation.progress import progress
+from thermostand.compensation.design import process
+from thermostand.experiments.steps import Capture, PlannedStep
+from thermostand.foundation.errors import ConfigError, StandError
+from thermostand.foundation.progress import progress
 
 MODEL_NAME, REPORT_NAME = "model.json", "report.html"
 DECIDES = process.__name__  # the module of the process that decides, which imports the rest when it is asked
@@ -48,9 +48,9 @@ def report_session(session: Path, folder: Path) -> Reported:
     when the frames do not allow it or a file cannot be written; what was recorded is as it was.
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
-    from compensation.drift.evaluation import table
-    from compensation.one_equilibrium import TwoEquilibria
-    from compensation.reporting.report import NoModel, analyse
+    from thermostand.compensation.drift.evaluation import table
+    from thermostand.compensation.one_equilibrium import TwoEquilibria
+    from thermostand.compensation.reporting.report import NoModel, analyse
 
     model, report = folder / MODEL_NAME, folder / REPORT_NAME
     try:

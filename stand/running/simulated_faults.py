@@ -6,10 +6,10 @@ import asyncio
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 
-from foundation.errors import ConfigError, Refused, Unreachable
-from stand.assembly import Assembly
-from stand.serving.desk import Conflict, FaultRequest, Missing, SimulatedFaults
-from stand.simulator import ControlSocket
+from thermostand.foundation.errors import ConfigError, Refused, Unreachable
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.serving.desk import Conflict, FaultRequest, Missing, SimulatedFaults
+from thermostand.stand.simulator import ControlSocket
 
 _ANSWERS_S = 5.0
 

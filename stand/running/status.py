@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from experiments.steps import words_of
-from foundation.clock import Clock, seconds_ns, utc_offset_ns
-from foundation.items import Batch, Event, Item, StepMark
-from foundation.readings import Quality
-from recording.writing.recorder import Recorder
-from stand.estimating.eta import Eta
-from stand.estimating.run_estimate import Night
-from stand.fault import Fault
-from stand.gate import Gate, Phase
-from stand.running.memory.state import RunState
-from stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
-from stand.serving.desk import RunStatus
+from thermostand.experiments.steps import words_of
+from thermostand.foundation.clock import Clock, seconds_ns, utc_offset_ns
+from thermostand.foundation.items import Batch, Event, Item, StepMark
+from thermostand.foundation.readings import Quality
+from thermostand.recording.writing.recorder import Recorder
+from thermostand.stand.estimating.eta import Eta
+from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import Gate, Phase
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
+from thermostand.stand.serving.desk import RunStatus
 
 State = Literal["running", "held", "stopping"]
 STATES: dict[Phase, State] = {

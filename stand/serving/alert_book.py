@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from foundation.clock import seconds_ns
-from foundation.events import RUN_BEGINS, RUN_END, RUN_FAILED, TITLES, AlertCause, alert_of
-from foundation.items import Event
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.events import RUN_BEGINS, RUN_END, RUN_FAILED, TITLES, AlertCause, alert_of
+from thermostand.foundation.items import Event
 
 _HOUR_NS = seconds_ns(3600)
 _BAD: frozenset[AlertCause] = frozenset({"trip", "hold", "device_lost", "disk"})

@@ -18,16 +18,16 @@ from threading import Event as Flag
 from threading import Thread
 from typing import cast
 
-from foundation.clock import Clock, VirtualClock, boot_time_ns, seconds_ns
-from foundation.errors import ConfigError
-from foundation.events import ALERT_FAILED, RUN_FAILED, alert_of
-from foundation.helper import Helper
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.tasks import cancelled, cause_of, failure_text
-from stand.config.alerts_section import AlertsConfig, load_secrets
-from stand.serving.alert_book import AlertBook, Message
-from stand.serving.alerts_process import MISSING, MODULE, deliver, ping
+from thermostand.foundation.clock import Clock, VirtualClock, boot_time_ns, seconds_ns
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.events import ALERT_FAILED, RUN_FAILED, alert_of
+from thermostand.foundation.helper import Helper
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.tasks import cancelled, cause_of, failure_text
+from thermostand.stand.config.alerts_section import AlertsConfig, load_secrets
+from thermostand.stand.serving.alert_book import AlertBook, Message
+from thermostand.stand.serving.alerts_process import MISSING, MODULE, deliver, ping
 
 _LIMIT_S = 20.0  # for a receiver
 _LOOK_S = 0.5

@@ -14,10 +14,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Thread
 
-from foundation.errors import ConfigError
-from stand.config.alerts_section import load_secrets
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.alerts_section import load_secrets
 
-MODULE = "stand.serving.alerts_process"
+MODULE = "thermostand.stand.serving.alerts_process"
 LEFT_NAME = "stand-alert-left"  # of a process whose daemon has gone
 MISSING = "alerts need Apprise: pip install 'thermostand[alerts]'"
 

@@ -21,10 +21,10 @@ from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
-from foundation.errors import ConfigError, SessionError
-from foundation.files import unreadable
-from stand.serving.desk import StandState
-from stand.serving.presence import STOP_SUFFIX, Daemon, address_in, living, opened_folder
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.files import unreadable
+from thermostand.stand.serving.desk import StandState
+from thermostand.stand.serving.presence import STOP_SUFFIX, Daemon, address_in, living, opened_folder
 
 API = "/api/v1"
 LIMIT_S = 5.0

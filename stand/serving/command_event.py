@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from pydantic import JsonValue
 
-from foundation.events import COMMAND
-from foundation.items import Event
-from stand.serving.desk import Verb, Who
+from thermostand.foundation.events import COMMAND
+from thermostand.foundation.items import Event
+from thermostand.stand.serving.desk import Verb, Who
 
 
 def command_event(

@@ -13,12 +13,12 @@ from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from foundation.documents import Document
-from foundation.errors import StandError
-from foundation.readings import Cause, Quality
-from recording.reading.notes import LONGEST_NOTE, TAG
-from stand.serving.not_confirmed import NotConfirmed
-from stand.serving.plan_faults import PlanCheck
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.readings import Cause, Quality
+from thermostand.recording.reading.notes import LONGEST_NOTE, TAG
+from thermostand.stand.serving.not_confirmed import NotConfirmed
+from thermostand.stand.serving.plan_faults import PlanCheck
 
 # Verbs of a command's event, in the words of the interface.
 Verb = Literal[

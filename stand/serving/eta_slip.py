@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from foundation.clock import NS_PER_S, Now
-from foundation.events import ETA_SLIPPED, PLAN_CHANGED
-from foundation.hub import Hub
-from foundation.instants import local_text
-from foundation.items import Event, Item, StepMark
-from stand.gate import HELD, RELEASED
+from thermostand.foundation.clock import NS_PER_S, Now
+from thermostand.foundation.events import ETA_SLIPPED, PLAN_CHANGED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.instants import local_text
+from thermostand.foundation.items import Event, Item, StepMark
+from thermostand.stand.gate import HELD, RELEASED
 
 _SHARE = 0.1
 _LEAST_S = 300.0  # a minute's slip of a short run is not reported

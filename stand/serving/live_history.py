@@ -16,9 +16,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.items import Batch, Event, Item, StepMark, StepState
-from foundation.readings import Quality
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
+from thermostand.foundation.readings import Quality
 
 FINE_S, FINE_CELLS = 1.0, 4 * 3600
 COARSE_S, COARSE_CELLS = 10.0, 7 * 24 * 360

@@ -15,19 +15,19 @@ from fastapi import APIRouter, Query, Response
 from fastapi import Path as PathOf
 from pydantic import BaseModel
 
-from foundation.errors import ConfigError
-from recording.format.layout import TELEMETRY
-from stand.config.stand_config import packaged
-from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.api.recorded import Disk, SessionName, session_in
-from stand.serving.api.stream import json_of
-from stand.serving.desk import Missing
-from stand.serving.live_history import MOST_POINTS
-from stand.serving.preview_process import session_columns, session_drift
-from stand.serving.viewing import Viewing
+from thermostand.foundation.errors import ConfigError
+from thermostand.recording.format.layout import TELEMETRY
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
+from thermostand.stand.serving.api.recorded import Disk, SessionName, session_in
+from thermostand.stand.serving.api.stream import json_of
+from thermostand.stand.serving.desk import Missing
+from thermostand.stand.serving.live_history import MOST_POINTS
+from thermostand.stand.serving.preview_process import session_columns, session_drift
+from thermostand.stand.serving.viewing import Viewing
 
 if TYPE_CHECKING:
-    from stand.serving.preview import Preview
+    from thermostand.stand.serving.preview import Preview
 
 PAGE = Path(__file__).parent / "page"
 _TYPES = {

@@ -21,8 +21,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import cast
 
-from foundation.errors import SessionError
-from foundation.lock_file import is_at, remove, take, try_lock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.lock_file import is_at, remove, take, try_lock
 
 NAME = "thermostand"
 SYSTEM_FOLDER = Path("/run/lock") / NAME

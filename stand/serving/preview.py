@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.errors import DetectionError
-from markers.detection import Detection, detect, grey_image
-from markers.edge_model import SIGMA
-from markers.plane import project, roll_deg
-from markers.target import Target
-from stand.serving.shot import DRIFT_ROLES, Image, Shot
+from thermostand.foundation.errors import DetectionError
+from thermostand.markers.detection import Detection, detect, grey_image
+from thermostand.markers.edge_model import SIGMA
+from thermostand.markers.plane import project, roll_deg
+from thermostand.markers.target import Target
+from thermostand.stand.serving.shot import DRIFT_ROLES, Image, Shot
 
 _JPEG_QUALITY = 80
 _BINS = 64

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.steps import Role
-from foundation.documents import parse_document
-from markers.target import Target
-from recording.reading.session import Session
-from stand.serving.preview import Previewer
-from stand.serving.shot import DRIFT_ROLES, Shot, is_reference
+from thermostand.experiments.steps import Role
+from thermostand.foundation.documents import parse_document
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
+from thermostand.stand.serving.preview import Previewer
+from thermostand.stand.serving.shot import DRIFT_ROLES, Shot, is_reference
 
 MOST_FRAMES = 120
 

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from foundation.clock import seconds_ns
-from foundation.errors import StandError
-from foundation.items import Batch
-from recording.format.decoded_items import item_of
-from recording.format.layout import FINISHED, TELEMETRY
-from recording.format.messages import KIND_OF_TOPIC
-from recording.format.records import telemetry_messages
-from recording.reading.session import Session
-from stand.serving.live_history import COARSE_CELLS, COARSE_S, Columns, History
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.items import Batch
+from thermostand.recording.format.decoded_items import item_of
+from thermostand.recording.format.layout import FINISHED, TELEMETRY
+from thermostand.recording.format.messages import KIND_OF_TOPIC
+from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.reading.session import Session
+from thermostand.stand.serving.live_history import COARSE_CELLS, COARSE_S, Columns, History
 
 WEEK_NS = seconds_ns(COARSE_S * COARSE_CELLS)
 _LOOKED_AT = 500  # batches for the units; every device is polled many times among so many

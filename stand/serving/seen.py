@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib.metadata
 from functools import cache
 
-from foundation.clock import Clock, utc_offset_ns
-from foundation.hub import Hub
-from foundation.readings import Quality, Reading
-from stand.config.stand_config import StandConfig
-from stand.serving.desk import ReadingState, StandState
-from stand.serving.not_confirmed import NotConfirmed
-from stand.stand import Stand
+from thermostand.foundation.clock import Clock, utc_offset_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.serving.desk import ReadingState, StandState
+from thermostand.stand.serving.not_confirmed import NotConfirmed
+from thermostand.stand.stand import Stand
 
 
 def seen_state(config: StandConfig, stand: Stand, hub: Hub, clock: Clock) -> StandState:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.steps import Role
+from thermostand.experiments.steps import Role
 
 # Drift is that of the camera, so it is measured in frames in which nothing else moves. "": a frame that no capture of a
 # run asked for.

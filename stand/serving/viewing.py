@@ -14,20 +14,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foundation.calls import Line
-from foundation.clock import Clock
-from foundation.errors import StandError
-from foundation.events import PREVIEW, RUN_BEGINS, RUN_RESUME, RUN_START
-from foundation.helper import Helper
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepMark, StepState
-from foundation.readings import Frame
-from stand.serving.live_history import History
-from stand.serving.preview_process import MODULE, previewer, recorded_week, run_references
-from stand.serving.shot import Shot, is_reference
+from thermostand.foundation.calls import Line
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.events import PREVIEW, RUN_BEGINS, RUN_RESUME, RUN_START
+from thermostand.foundation.helper import Helper
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
+from thermostand.foundation.readings import Frame
+from thermostand.stand.serving.live_history import History
+from thermostand.stand.serving.preview_process import MODULE, previewer, recorded_week, run_references
+from thermostand.stand.serving.shot import Shot, is_reference
 
 if TYPE_CHECKING:
-    from stand.serving.preview import Preview
+    from thermostand.stand.serving.preview import Preview
 
 _WAITING = 20_000  # items; the thread takes them every second
 _TAKE_S = 1.0

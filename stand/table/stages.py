@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.devices.motion.stage import Axis
-from foundation.clock import Clock
-from foundation.errors import ConfigError
-from foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE, HOMED, RE_APPROACHED
-from foundation.hub import Hub
-from foundation.readings import Quality
-from stand.interlock import Interlock, Motions
+from thermostand.drivers.devices.motion.stage import Axis
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE, HOMED, RE_APPROACHED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Quality
+from thermostand.stand.interlock import Interlock, Motions
 
 # A stepper that slips loses whole electrical periods of four full steps; what is less than half of one is the switch.
 HOME_RESIDUAL_LIMIT_STEPS = 2.0

@@ -8,14 +8,14 @@ from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
-from foundation.calls import Line
-from foundation.errors import StandError
-from foundation.helper import Helper
-from foundation.hub import Hub
-from foundation.items import Item, StepMark, StepState
-from foundation.readings import Frame
-from stand.serving.preview_process import MODULE, previewer, run_references
-from stand.serving.shot import DRIFT_ROLES, Shot, is_reference
+from thermostand.foundation.calls import Line
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.helper import Helper
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item, StepMark, StepState
+from thermostand.foundation.readings import Frame
+from thermostand.stand.serving.preview_process import MODULE, previewer, run_references
+from thermostand.stand.serving.shot import DRIFT_ROLES, Shot, is_reference
 
 _LOOK_S = 1.0
 _LOOK = "look"

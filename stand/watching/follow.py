@@ -8,18 +8,24 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-from experiments.steps import words_of
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, CLOCK_STEP, RUN_BEGINS, TO_AMBIENT
-from foundation.items import Batch, Event, Item, Original, StepMark
-from foundation.readings import Frame, Quality
-from recording.format.utc_offsets import UtcOffsets, offsets_of
-from stand.estimating.eta import Eta
-from stand.estimating.run_estimate import Night
-from stand.gate import HELD, RELEASED
-from stand.running.status import doing_in_words
-from stand.watching.moment import AIR, CAMERA, SET_POINT, Moment, held_by
-from stand.watching.remedies import next_command
+from thermostand.experiments.steps import words_of
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.events import (
+    CAMERA_EQUILIBRIUM,
+    CAMERA_EQUILIBRIUM_LOST,
+    CLOCK_STEP,
+    RUN_BEGINS,
+    TO_AMBIENT,
+)
+from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
+from thermostand.foundation.readings import Frame, Quality
+from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
+from thermostand.stand.estimating.eta import Eta
+from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.gate import HELD, RELEASED
+from thermostand.stand.running.status import doing_in_words
+from thermostand.stand.watching.moment import AIR, CAMERA, SET_POINT, Moment, held_by
+from thermostand.stand.watching.remedies import next_command
 
 _LEAST_S = 1.0  # of stand time between two reports, or a thousandth of the night: terminals are slow
 _SHARE = 1e-3

@@ -17,8 +17,8 @@ import foxglove
 from foxglove.channels import CompressedImageChannel, LogChannel
 from foxglove.messages import CompressedImage, Log, LogLevel, Timestamp
 
-from foundation.clock import NS_PER_S
-from stand.serving.desk import StandState
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.serving.desk import StandState
 
 HOST = "127.0.0.1"
 _BACKLOG = 8  # messages that wait for a slow viewer; the oldest is dropped

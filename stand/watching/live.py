@@ -14,18 +14,18 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from foundation.clock import NS_PER_S, Now, WallClock
-from foundation.hub import Hub
-from foundation.output import output
-from foundation.usage import one_line
-from stand.estimating.run_estimate import Night
-from stand.running.order import Order
-from stand.running.resume import Interruption
-from stand.watching.aside import aside
-from stand.watching.drift import drift_watched
-from stand.watching.follow import Follow
-from stand.watching.moment import Moment, free_bytes
-from stand.watching.panel import panel_lines, plain_line
+from thermostand.foundation.clock import NS_PER_S, Now, WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.output import output
+from thermostand.foundation.usage import one_line
+from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import Interruption
+from thermostand.stand.watching.aside import aside
+from thermostand.stand.watching.drift import drift_watched
+from thermostand.stand.watching.follow import Follow
+from thermostand.stand.watching.moment import Moment, free_bytes
+from thermostand.stand.watching.panel import panel_lines, plain_line
 
 _BETWEEN_PANELS_NS = NS_PER_S // 4
 _BETWEEN_LINES_NS = 60 * NS_PER_S

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from foundation.instants import local_text
-from stand.estimating.run_estimate import existing
-from stand.gate import IN_WORDS
-from stand.serving.desk import StandState
+from thermostand.foundation.instants import local_text
+from thermostand.stand.estimating.run_estimate import existing
+from thermostand.stand.gate import IN_WORDS
+from thermostand.stand.serving.desk import StandState
 
 SET_POINT, AIR, CAMERA = "regulator.sp", "thermometers.air", "camera.temperature"
 

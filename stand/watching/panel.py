@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from foundation.instants import duration, local_text
-from foundation.usage import one_line
-from stand.watching.moment import Moment
+from thermostand.foundation.instants import duration, local_text
+from thermostand.foundation.usage import one_line
+from thermostand.stand.watching.moment import Moment
 
 _BAR = 24
 

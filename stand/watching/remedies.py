@@ -5,10 +5,10 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 
-from foundation.events import GUARD, KINDS, EventKind, advice_for
-from stand import gate as gate
-from stand.guarding import guard as guard
-from stand.guarding import rules as rules  # these three register rows of their own
+from thermostand.foundation.events import GUARD, KINDS, EventKind, advice_for
+from thermostand.stand import gate as gate
+from thermostand.stand.guarding import guard as guard
+from thermostand.stand.guarding import rules as rules  # these three register rows of their own
 
 _HEAD = """# Troubleshooting
 

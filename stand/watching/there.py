@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import cast
 
-from foundation.errors import SessionError
-from foundation.instants import local_text
-from stand.serving.client import API, Server
-from stand.serving.desk import StandState
-from stand.watching.moment import Moment, moment_of
-from stand.watching.remedies import next_command
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.instants import local_text
+from thermostand.stand.serving.client import API, Server
+from thermostand.stand.serving.desk import StandState
+from thermostand.stand.watching.moment import Moment, moment_of
+from thermostand.stand.watching.remedies import next_command
 
 _EVENTS = 500
 

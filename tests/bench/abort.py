@@ -19,25 +19,25 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from drivers.devices.relays import Relays
-from drivers.wires.registers import load_register_map
-from foundation.clock import WallClock, seconds_ns
-from foundation.errors import StandTripped
-from foundation.hub import Hub
-from foundation.tasks import cancelled
-from stand.assembly import Assembly, assemble
-from stand.chamber.chamber import ChamberLimits
-from stand.chamber.permits import PermitLimits
-from stand.config.stand_config import StandConfig, packaged
-from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Watch, over_temperature
-from stand.imaging.camera_supply import SupplyLimits
-from stand.running.opening.stop import Interrupted, Stop
-from stand.simulator import ControlSocket, Simulator, laboratory_of
-from stand.stand import Devices, Stand
 from tests.bench.figures import Figure, at_most, progress
 from tests.bench.waiting import beside, p99, waiting
 from tests.system.simulated_orders import simulated_order
+from thermostand.drivers.devices.relays import Relays
+from thermostand.drivers.wires.registers import load_register_map
+from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.errors import StandTripped
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.tasks import cancelled
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.chamber.chamber import ChamberLimits
+from thermostand.stand.chamber.permits import PermitLimits
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.guarding.guard import Guard
+from thermostand.stand.guarding.interlocks import Watch, over_temperature
+from thermostand.stand.imaging.camera_supply import SupplyLimits
+from thermostand.stand.running.opening.stop import Interrupted, Stop
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
+from thermostand.stand.stand import Devices, Stand
 
 TRIPS = 60  # of each kind
 LIMIT_ms = 20.0

@@ -6,12 +6,12 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-from compensation.apply.c_header import export_c
-from compensation.drift.paper_model import PaperModel
-from compensation.drift.thermal_model import ThermalModel
 from tests.bench.figures import Figure, absolute, at_most, progress, side_by_side, skipped
 from tests.compensation.compiled_header import COMPILER
 from tests.compensation.made_up_models import paper, thermal
+from thermostand.compensation.apply.c_header import export_c
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.thermal_model import ThermalModel
 
 SIZE = (2448, 2048)
 _PROGRAM = Path(__file__).with_name("c_header.c")

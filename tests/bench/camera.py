@@ -12,13 +12,13 @@ import math
 import time
 from pathlib import Path
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.framing.aravis_library import library
-from drivers.wires.camera_settings import GigeCameraSettings
-from foundation.clock import WallClock
-from foundation.errors import StandError
 from tests.bench.fakes import fakes
 from tests.bench.figures import Figure, progress, side_by_side, skipped
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import StandError
 
 ROUNDS = 5
 FRAMES = 8  # in one measurement

@@ -13,9 +13,6 @@ from statistics import mean
 import cv2
 import numpy as np
 
-from markers.detection import Detection, detect
-from markers.target import load_target
-from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, at_most, progress
 from tests.compensation.rendered import Float, Scene, render, true_centres_px
 from tests.compensation.spoiled import (
@@ -28,6 +25,9 @@ from tests.compensation.spoiled import (
     unequal_pixels,
     with_gamma,
 )
+from thermostand.markers.detection import Detection, detect
+from thermostand.markers.target import load_target
+from thermostand.stand.config.stand_config import packaged
 
 FRAMES = 24
 CLEAN_FRAMES = 100

@@ -8,10 +8,10 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from recording.reading.session import Session
 from tests.bench.figures import Figure, absolute, at_most, progress, skipped
 from tests.bench.pipeline import SEQUENCE, photographed, write_session
 from tests.compensation.cluster_week import CAMERAS, week
+from thermostand.recording.reading.session import Session
 
 FRAMES, PER_PIECE = 48, 16
 WEEK = 4_000_000

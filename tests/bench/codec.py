@@ -19,17 +19,17 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
-from compensation.finding.png_rows import decode_rows
-from foundation.clock import NS_PER_S
-from foundation.readings import Frame
-from markers.detection import detect, rows_to_follow
-from markers.target import load_target
-from markers.windows import marker_windows
-from recording.format.images import IMAGE_CLASS, decode_image, encode_image
-from recording.format.roi import RoiEncoder
-from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, at_most, in_turns, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, render, shaded_light
+from thermostand.compensation.finding.png_rows import decode_rows
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.readings import Frame
+from thermostand.markers.detection import detect, rows_to_follow
+from thermostand.markers.target import load_target
+from thermostand.markers.windows import marker_windows
+from thermostand.recording.format.images import IMAGE_CLASS, decode_image, encode_image
+from thermostand.recording.format.roi import RoiEncoder
+from thermostand.stand.config.stand_config import packaged
 
 ROUNDS = 11
 START_NS = 1_767_290_400 * NS_PER_S

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from compensation.datasheet.datasheet import Datasheet, datasheet
-from compensation.drift.choosing import fit
 from tests.bench.figures import Figure, absolute, at_least, progress
 from tests.compensation.drawn_cameras import REPEATING, UNREPEATING, Camera, drawn_camera
 from tests.compensation.drawn_nights import full_night, night
 from tests.compensation.test_datasheet import COEFFICIENTS, at_rest_per_K
+from thermostand.compensation.datasheet.datasheet import Datasheet, datasheet
+from thermostand.compensation.drift.choosing import fit
 
 CAMERAS = 20
 _FIRST, _CHANCE = 2000, 0.4

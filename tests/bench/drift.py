@@ -12,12 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from compensation.drift.choosing import FORMS, fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import evaluate
-from compensation.drift.training import frame_states
-from drivers.sim.physics.optics import CameraKind
-from experiments.steps import Role
 from tests.bench import (
     drift_beyond,
     drift_bumps,
@@ -30,6 +24,12 @@ from tests.bench import (
 )
 from tests.bench.figures import Figure, at_most, progress, side_by_side
 from tests.compensation.plant_night import Dwell, Seen, WarmUp, night, warm_up_and_cycles
+from thermostand.compensation.drift.choosing import FORMS, fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import evaluate
+from thermostand.compensation.drift.training import frame_states
+from thermostand.drivers.sim.physics.optics import CameraKind
+from thermostand.experiments.steps import Role
 
 SEEDS = (5, 6, 7, 8)  # the terms were chosen with nights of seeds 1 to 4 in view
 CYCLES = 2

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from compensation.drift.choosing import fit
-from experiments.steps import Role
 from tests.bench.drift_drawn import effects_of, score
 from tests.bench.figures import Figure, absolute, at_least, progress
 from tests.compensation.drawn_cameras import drawn_camera
 from tests.compensation.drawn_nights import cycle, night, reference, warm_up
+from thermostand.compensation.drift.choosing import fit
+from thermostand.experiments.steps import Role
 
 CAMERAS = 12
 FITTED_DEGC = (27, 31, 34, 38, 41, 45, 41, 38, 34, 31, 27, 24, 20, 17, 20, 24)

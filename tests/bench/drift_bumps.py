@@ -7,13 +7,13 @@ from functools import cache
 
 import numpy as np
 
-from compensation.drift.bumps import find_bumps
-from compensation.drift.choosing import fit
-from experiments.steps import Role
 from tests.bench.drift_drawn import drawn_night, effects_of, score
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, side_by_side
 from tests.compensation.drawn_cameras import drawn_camera
 from tests.compensation.drawn_nights import START_NS, Bump, full_night, night
+from thermostand.compensation.drift.bumps import find_bumps
+from thermostand.compensation.drift.choosing import fit
+from thermostand.experiments.steps import Role
 
 CLEAN_NIGHTS, BUMPED_NIGHTS = 300, 20
 SIZES_PX = (0.05, 0.1, 0.3)

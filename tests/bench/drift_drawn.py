@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.drift.choosing import FORMS, fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.training import frame_states
-from experiments.steps import Role
 from tests.bench.figures import Figure, absolute, at_most, progress, side_by_side
 from tests.compensation.drawn_cameras import REPEATING, UNREPEATING, drawn_camera
 from tests.compensation.drawn_nights import Night, cycle, full_night, night, reference, unseen_begin
+from thermostand.compensation.drift.choosing import FORMS, fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.experiments.steps import Role
 
 CAMERAS = 20
 GOAL_MPX = {"repeating": 5.0, "beside what does not repeat": 10.0}

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from compensation.drift.choosing import fit
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.observations import concatenate
-from experiments.steps import Role
 from tests.bench.drift_drawn import effects_of, score
 from tests.bench.figures import Figure, absolute, at_least, progress, side_by_side
 from tests.compensation.drawn_cameras import drawn_camera
 from tests.compensation.drawn_nights import cycle, full_night, night, reference, warm_up
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.observations import concatenate
+from thermostand.experiments.steps import Role
 
 CAMERAS, FIRST_FEW, FIRST_SEVERAL = 6, 2800, 2900
 WAYS_DEGC = ((38, 52, 38, 24, 10, 24), (34, 44, 52, 44, 34, 24, 17, 10, 17, 24))

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from compensation.drift.choosing import fit
-from compensation.observations import Observations
 from tests.bench.figures import Figure, absolute, at_least, progress
 from tests.benchmark.methods import corrector
 from tests.benchmark.nights import GROUPS, TASKS, TRAININGS, case
 from tests.benchmark.scoring import Corrector, Score, scores
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.observations import Observations
 
 FIRST, CAMERAS = 40, 6  # beyond those of `make benchmark`
 LEAST_COVERED = 92

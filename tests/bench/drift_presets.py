@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensation.drift.choosing import fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.training import frame_states
-from drivers.camera_preset import Effect
-from experiments.steps import Role
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, side_by_side
 from tests.compensation.plant_night import Dwell, Published, Seen, WarmUp, night, warm_up_and_cycles
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.drivers.camera_preset import Effect
+from thermostand.experiments.steps import Role
 
 PRESETS = ("nac", "navcam", "dic", "phone")
 NUMBERS = range(200, 203)

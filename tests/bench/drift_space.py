@@ -7,15 +7,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from compensation.drift.choosing import FORMS, fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.training import frame_states
-from compensation.observations import Float
-from experiments.steps import Role
 from tests.bench.drift_drawn import effects_of
 from tests.bench.figures import Figure, at_most, progress, side_by_side
 from tests.compensation.drawn_cameras import FOCAL_PX, RADIAL, drawn_camera, target_mm
 from tests.compensation.drawn_nights import Night, cycle, full_night, night, reference, warm_up
+from thermostand.compensation.drift.choosing import FORMS, fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Float
+from thermostand.experiments.steps import Role
 
 CAMERAS, FIRST = 10, 3300
 POSITIONS = ((0.0, 0.0), (25.0, 8.0), (-60.0, -20.0), (70.0, 22.0))

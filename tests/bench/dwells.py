@@ -7,11 +7,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from compensation.drift.choosing import fit
 from tests.bench.drift_drawn import effects_of, score
 from tests.bench.figures import Figure, absolute, at_most, progress
 from tests.compensation.drawn_cameras import drawn_camera
 from tests.compensation.drawn_nights import DWELL_S, Stretch, night, reference, warm_up
+from thermostand.compensation.drift.choosing import fit
 
 FIRST, CAMERAS = 60, 10
 SHARE, GOAL = 0.65, 1.0

@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from markers.target import Target, load_target
-from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, at_least, progress
 from tests.compensation.identified import SCENES, TARGETS, Image, judged, own, posed
 from tests.compensation.rendered import Float, Scene, photograph, render
+from thermostand.markers.target import Target, load_target
+from thermostand.stand.config.stand_config import packaged
 
 POSES = 10
 POSES_OF_TARGETS = 5

@@ -16,19 +16,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
-from drivers.framing.aravis_library import library
-from drivers.wires.camera_connection import Connection, Shot
-from foundation.clock import WallClock, seconds_ns
-from foundation.errors import StandError
-from foundation.hub import Hub
-from foundation.items import Item
-from foundation.readings import Frame
-from stand.running.order import Order
-from stand.running.run import run_real
-from stand.simulator import Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
 from tests.bench.waiting import beside, p99, waiting
 from tests.system.simulated_orders import simulated_order
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.drivers.wires.camera_connection import Connection, Shot
+from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item
+from thermostand.foundation.readings import Frame
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_real
+from thermostand.stand.simulator import Simulator, laboratory_of
 
 FRAMES = 101  # so that the 99th percentile is not the longest
 INTERVAL_s = 0.5

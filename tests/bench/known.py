@@ -18,12 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from compensation.design.next_visit import Wanted, decide
-from compensation.drift.choosing import fit
-from experiments.known import Enough, Frames, Visit, after_decision, first_decision, fixed_visits
-from experiments.parameters import Known
-from experiments.steps import Capture, Decide, SetTemperature, Soak, Step, usual_s
-from foundation.errors import SessionError
 from tests.bench.drift_drawn import Score, effects_of, score
 from tests.bench.figures import Figure, absolute, at_most, progress
 from tests.compensation.drawn_cameras import Camera, drawn_camera
@@ -38,6 +32,12 @@ from tests.compensation.drawn_nights import (
     reference,
     warm_up,
 )
+from thermostand.compensation.design.next_visit import Wanted, decide
+from thermostand.compensation.drift.choosing import fit
+from thermostand.experiments.known import Enough, Frames, Visit, after_decision, first_decision, fixed_visits
+from thermostand.experiments.parameters import Known
+from thermostand.experiments.steps import Capture, Decide, SetTemperature, Soak, Step, usual_s
+from thermostand.foundation.errors import SessionError
 
 CAMERAS = 10
 GOAL, LIMIT, SETTLED_GOAL = 60.0, 110.0, 65.0

@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.hub import Hub
-from foundation.readings import Frame
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.bench.figures import Figure, absolute, at_least, at_most, in_turns, progress, ratio_at_least, side_by_side
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Frame
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 LINE_RATE_MB_S = 118.0
 DURATION_S = 60.0

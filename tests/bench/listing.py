@@ -29,7 +29,7 @@ def sessions(folder: Path, count: int = SESSIONS) -> Path:
 
 def listed(folder: Path) -> Measurement:
     """A process of its own, from its start to its end, ms."""
-    command = [sys.executable, "-m", "stand.cli", "session", "list", str(folder)]
+    command = [sys.executable, "-m", "thermostand.stand.cli", "session", "list", str(folder)]
     return lambda: milliseconds(lambda: subprocess.run(command, capture_output=True, check=True))
 
 

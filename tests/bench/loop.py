@@ -16,16 +16,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
-from drivers.framing.aravis_library import library
-from foundation.clock import WallClock
-from foundation.errors import DeviceError, StandError
-from foundation.hub import Hub
-from stand.assembly import Assembly, assemble
-from stand.running.opening.open_stand import close_devices
-from stand.running.order import Order
-from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.bench.figures import Figure, at_most, progress, skipped
 from tests.system.simulated_orders import simulated_order
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import DeviceError, StandError
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.running.opening.open_stand import close_devices
+from thermostand.stand.running.order import Order
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 LIMIT_ms = 5.0
 READS, FRAMES = 40, 12

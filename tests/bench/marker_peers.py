@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.target import Target
+from thermostand.markers.target import Target
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Float = NDArray[np.float64]

@@ -16,10 +16,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from markers.detection import Detection, Flag, Noise, detect
-from markers.eccentricity import disc_centres_px
-from markers.target import Target, load_target
-from stand.config.stand_config import packaged
 from tests.bench.figures import (
     Figure,
     absolute,
@@ -32,6 +28,10 @@ from tests.bench.figures import (
 )
 from tests.bench.marker_peers import COMMON, STRONGEST, Float, Image, Peer, opencv_peers, scikit_image_peers
 from tests.compensation.rendered import Scene, photograph, project, render, shaded_light, true_centres_px
+from thermostand.markers.detection import Detection, Flag, Noise, detect
+from thermostand.markers.eccentricity import disc_centres_px
+from thermostand.markers.target import Target, load_target
+from thermostand.stand.config.stand_config import packaged
 
 ROUNDS = 5
 FRAMES = 4

@@ -15,14 +15,14 @@ from pathlib import Path
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.client.base import ModbusBaseSyncClient
 
-from drivers.devices.regulators.regulator import Regulator
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.modbus_unit import Block, plan_blocks
-from drivers.wires.registers import RegisterMap, load_register_map
-from foundation.clock import WallClock
-from stand.config.stand_config import packaged
 from tests.bench.fakes import fakes
 from tests.bench.figures import Figure, in_turns, per_second, progress, side_by_side
+from thermostand.drivers.devices.regulators.regulator import Regulator
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.modbus_unit import Block, plan_blocks
+from thermostand.drivers.wires.registers import RegisterMap, load_register_map
+from thermostand.foundation.clock import WallClock
+from thermostand.stand.config.stand_config import packaged
 
 ROUNDS = 9
 READS = 40  # of the regulator, in one measurement

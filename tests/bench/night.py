@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.framing.aravis_library import library
-from foundation.errors import StandError
 from tests.bench.figures import Figure, at_least, at_most, progress, skipped
 from tests.system.protocol_night import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes
 from tests.system.simulated_orders import simulated_order
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.foundation.errors import StandError
 
 BRIEF_PROTOCOL = PROTOCOL.replace("2700", "300").replace("cycles: 2", "reference_frames: 2")
 REPEATS = 3

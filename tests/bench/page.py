@@ -17,11 +17,11 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
-from foundation.clock import NS_PER_S
 from tests.bench.figures import Figure, at_most, progress, skipped
 from tests.bench.waiting import beside, p99, waiting
 from tests.stand.browser import CHROMIUM, a_page, browser
 from tests.stand.page_desk import NightDesk, a_night, frame_of, free_port, target_image
+from thermostand.foundation.clock import NS_PER_S
 
 DAY_S = 24 * 3600
 POLL_s = 5.0

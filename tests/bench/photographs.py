@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.band import NARROW_SIGMA, WIDE_SIGMA
-from markers.detection import Detection, Image, detect
-from markers.image_file import read_image
-from markers.target import Target, load_target
-from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, progress, ratio_at_most, side_by_side, skipped
+from thermostand.markers.band import NARROW_SIGMA, WIDE_SIGMA
+from thermostand.markers.detection import Detection, Image, detect
+from thermostand.markers.image_file import read_image
+from thermostand.markers.target import Target, load_target
+from thermostand.stand.config.stand_config import packaged
 
 Float = NDArray[np.float64]
 

@@ -22,20 +22,20 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType
 
-from foundation.clock import NS_PER_S
-from foundation.items import Batch, Item, StepMark, StepState
-from foundation.readings import Frame, Reading
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_png
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.messages import timestamp
-from recording.reading.session import Session
-from recording.writing.forms import telemetry_topics
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
-from recording.writing.telemetry import TelemetryEncoder
-from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, photograph, render
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Batch, Item, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_png
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.messages import timestamp
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.forms import telemetry_topics
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.telemetry import TelemetryEncoder
+from thermostand.stand.config.stand_config import packaged
 
 COUNT = 3600
 FEW = 450  # an eighth
@@ -102,7 +102,7 @@ def _reported(session: Path, workers: int) -> Reported:
         "used = resource.getrusage(resource.RUSAGE_CHILDREN);"
         "print(used.ru_maxrss, used.ru_utime + used.ru_stime)"
     )
-    command = [sys.executable, "-m", "compensation.cli", "report", str(session), "-o", str(out)]
+    command = [sys.executable, "-m", "thermostand.compensation.cli", "report", str(session), "-o", str(out)]
     begin_s = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-c", program, *command, "--workers", str(workers), "--no-cache"],

@@ -21,19 +21,19 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from foundation.clock import NS_PER_S
-from foundation.items import Batch
-from foundation.readings import Frame, Reading
-from recording.format import kinds, messages
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FORMAT, FRAMES, TELEMETRY
-from recording.reading.session import Session
-from recording.writing.forms import telemetry_topics
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
-from recording.writing.telemetry import TelemetryEncoder
 from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
 from tests.recording.recordings import DEVICES
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.format import kinds, messages
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.forms import telemetry_topics
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.telemetry import TelemetryEncoder
 
 ROUNDS = 50
 START_NS = 1_767_290_400 * NS_PER_S

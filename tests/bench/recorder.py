@@ -18,14 +18,14 @@ import numpy as np
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.physics.scene import Scene, SceneSpec
-from foundation.clock import NS_PER_S
-from foundation.readings import Frame
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
 from tests.bench.figures import Figure, at_most, in_turns, progress, ratio_at_least, side_by_side
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.physics.scene import Scene, SceneSpec
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, ImageEncoding, encode_image
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
 
 ROUNDS = 15
 FRAMES = 4  # in one measurement

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.sim.physics.plant import Plant, PlantSpec, STEP_ns
-from drivers.sim.physics.scene import Scene, SceneSpec
-from drivers.sim.units.regulator import FakeRegulator
-from drivers.sim.units.relays import FakeRelays
-from foundation.clock import NS_PER_S, FollowedClock
 from tests.bench.figures import Figure, absolute, milliseconds, progress
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec, STEP_ns
+from thermostand.drivers.sim.physics.scene import Scene, SceneSpec
+from thermostand.drivers.sim.units.regulator import FakeRegulator
+from thermostand.drivers.sim.units.relays import FakeRelays
+from thermostand.foundation.clock import NS_PER_S, FollowedClock
 
 ROUNDS = 7
 STEPS = 5000  # in one measurement

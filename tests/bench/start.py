@@ -12,9 +12,9 @@ from tests.bench.figures import Figure, Measurement, in_turns, milliseconds, rat
 ROUNDS = 5
 PEER = ("-c", "import numpy, google.protobuf, mcap")
 OURS = {
-    "stand --help": ("-m", "stand.cli", "--help"),
-    "compensate --help": ("-m", "compensation.cli", "--help"),
-    "import recording": ("-c", "import recording"),
+    "stand --help": ("-m", "thermostand.stand.cli", "--help"),
+    "compensate --help": ("-m", "thermostand.compensation.cli", "--help"),
+    "import thermostand.recording": ("-c", "import thermostand.recording"),
     "import thermostand": ("-c", "import thermostand"),
 }
 MOST = 2.0  # 0.3 s where the peer takes 0.15 s

@@ -16,14 +16,14 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from foundation.errors import SessionError
-from stand.serving.client import Server, server_of
-from stand.serving.presence import living
 from tests.bench.figures import Figure, at_most, progress
 from tests.bench.viewers import FOLLOW, VIEWERS
 from tests.bench.waiting import beside, p99, waiting
 from tests.stand import floods
 from tests.stand.test_interface_access import free_port
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.serving.client import Server, server_of
+from thermostand.stand.serving.presence import living
 
 STOPS, FLOODED_STOPS = 200, 10
 LIMIT_ms, FLOODED_LIMIT_ms = 20.0, 1000.0
@@ -33,8 +33,8 @@ BETWEEN_S = 0.12  # two STOPs within 0.1 s would be one
 DAEMON = """
 import asyncio, sys
 from pathlib import Path
-from stand.serving.api.doors import Interface
-from stand.serving.secop.door import door_at
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.secop.door import door_at
 from tests.stand.a_desk import ADesk, served
 
 async def run():

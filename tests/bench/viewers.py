@@ -16,25 +16,25 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
-from drivers.framing.aravis_library import library
-from foundation.errors import StandError
-from stand.assembly import Assembly
-from stand.config.stand_config import StandConfig
-from stand.running.memory.fold import fold
-from stand.running.memory.journal import Logbook
-from stand.running.opening.stop import Interrupted, Stop
-from stand.running.run_desk import RunDesk
-from stand.serving.api.doors import Interface
-from stand.serving.api.server import serve
-from stand.serving.client import Server, server_of
-from stand.serving.desk import Done, StandState, Who
-from stand.serving.presence import living
-from stand.serving.seen import seen_state
-from stand.stand import Stand
 from tests.bench import abort, jitter
 from tests.bench.figures import Figure, progress, skipped
 from tests.bench.waiting import waiting
 from tests.system.simulated_orders import simulated_order
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.foundation.errors import StandError
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.memory.journal import Logbook
+from thermostand.stand.running.opening.stop import Interrupted, Stop
+from thermostand.stand.running.run_desk import RunDesk
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.server import serve
+from thermostand.stand.serving.client import Server, server_of
+from thermostand.stand.serving.desk import Done, StandState, Who
+from thermostand.stand.serving.presence import living
+from thermostand.stand.serving.seen import seen_state
+from thermostand.stand.stand import Stand
 
 VIEWERS = 10
 TRIPS = 60

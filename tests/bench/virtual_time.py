@@ -13,17 +13,17 @@ import shutil
 import time
 from pathlib import Path
 
-from drivers.framing.aravis_library import library
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.errors import StandError
-from foundation.hub import Hub
-from foundation.items import Item, StepMark, StepState
-from stand.running.opening.one_cpu import one_cpu
-from stand.running.order import Order
-from stand.running.run import run_virtual
-from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
 from tests.system.simulated_orders import simulated_order
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item, StepMark, StepState
+from thermostand.stand.running.opening.one_cpu import one_cpu
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 ROUNDS = 5
 SOAK_s = 1800.0

@@ -15,7 +15,7 @@ from tests.bench.figures import Figure
 
 WAIT = """
 import json, signal, sys
-from foundation.clock import WallClock, block_until
+from thermostand.foundation.clock import WallClock, block_until
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 clock, late_ms = WallClock(), []

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.apply.compensate_images import warp
-from compensation.drift_runtime import source_offset
-from markers.detection import detect
-from markers.target import load_target
-from stand.config.stand_config import packaged
 from tests.bench.figures import Figure, at_most, in_turns, progress, side_by_side
 from tests.compensation.rendered import Scene, render
+from thermostand.compensation.apply.compensate_images import warp
+from thermostand.compensation.drift_runtime import source_offset
+from thermostand.markers.detection import detect
+from thermostand.markers.target import load_target
+from thermostand.stand.config.stand_config import packaged
 
 ROUNDS = 7
 NOT_SPLIT: Any = None  # its stub wants two maps

@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from foundation import calls
-from foundation.items import Item, StepMark, StepState
-from stand.running.run import Interrupted, StandTripped, run_real
-from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.system.simulated_orders import simulated_order
+from thermostand.foundation import calls
+from thermostand.foundation.items import Item, StepMark, StepState
+from thermostand.stand.running.run import Interrupted, StandTripped, run_real
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTES = "WAYS_NOTES"  # the environment variable with the file of the notes
@@ -160,7 +160,7 @@ def trace_here() -> None:
 def _in_children(directory: Path) -> None:
     """Each helper process begins to trace by itself."""
     text = (
-        "import sys\nif 'recording.writing.disk' in sys.orig_argv:\n"
+        "import sys\nif 'thermostand.recording.writing.disk' in sys.orig_argv:\n"
         "    from tests.bench.ways import trace_here\n    trace_here()\n"
     )
     (directory / "sitecustomize.py").write_text(text)

@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-from drivers.devices.motion.stage import Axis, AxisSettings
-from drivers.wires.link import SerialSettings, open_link
-from drivers.wires.ximc_client import XimcClient
-from foundation.clock import WallClock
 from tests.bench.fakes import fakes
 from tests.bench.figures import Figure, in_turns, per_second, progress, side_by_side, skipped
+from thermostand.drivers.devices.motion.stage import Axis, AxisSettings
+from thermostand.drivers.wires.link import SerialSettings, open_link
+from thermostand.drivers.wires.ximc_client import XimcClient
+from thermostand.foundation.clock import WallClock
 
 ROUNDS = 9
 READS = 400  # in one measurement

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.observations import Observations
 from tests.benchmark.scoring import Correction, Corrector, Float
+from thermostand.compensation.observations import Observations
 
 NAME = "a table of affine motions"
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from compensation.drift.choosing import fit
-from compensation.drift.displacements import displacements
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.training import frame_states
-from compensation.history.states import States
-from compensation.observations import Observations
-from experiments.steps import Role
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.displacements import displacements
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.states import States
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
 
 from .scoring import Correction, Corrector, Float, Method
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.observations import Observations
-from experiments.steps import Role
 from tests.compensation.drawn_cameras import REPEATING, UNREPEATING, drawn_camera
 from tests.compensation.drawn_nights import Night, Stretch, followed_cycle, full_night, night, reference, warm_up
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
 
 Float = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.observations import Observations
+from thermostand.compensation.observations import Observations
 
 from .nights import GROUPS, TASKS, TRAININGS, Case
 

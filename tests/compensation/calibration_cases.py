@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.calibration.board import Board, board_of
-from compensation.calibration.pose import Lens, find_pose
-from compensation.calibration.session_centres import Positions
-from compensation.calibration.stage_geometry import Table
-from markers.target import Target
+from thermostand.compensation.calibration.board import Board, board_of
+from thermostand.compensation.calibration.pose import Lens, find_pose
+from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.stage_geometry import Table
+from thermostand.markers.target import Target
 
 from .calibration_truth import SIZE, Laboratory, true_table_frame
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import psutil
 
-from compensation.finding.piece import FoundMarkers, Piece, joined, pieces_of
-from compensation.finding.workers import on_cluster
-from compensation.observations import session_target
-from recording.reading.session import Session
+from thermostand.compensation.finding.piece import FoundMarkers, Piece, joined, pieces_of
+from thermostand.compensation.finding.workers import on_cluster
+from thermostand.compensation.observations import session_target
+from thermostand.recording.reading.session import Session
 
 CAMERAS = 10
 KILLED_IN = CAMERAS // 2

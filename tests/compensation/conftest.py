@@ -17,16 +17,16 @@ import pytest
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from compensation.finding.png_rows import decode_rows
-from compensation.reporting.drawing import figures
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepMark, StepState
-from foundation.readings import Frame, Reading
-from markers.compile_ahead import compile_ahead
-from recording.format.images import encode_png
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.addresses import WORKER
+from thermostand.compensation.finding.png_rows import decode_rows
+from thermostand.compensation.reporting.drawing import figures
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.markers.compile_ahead import compile_ahead
+from thermostand.recording.format.images import encode_png
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.thermal_history import History, refined
-from compensation.observations import Observations
+from thermostand.compensation.history.thermal_history import History, refined
+from thermostand.compensation.observations import Observations
 
 from .drawn_cameras import (
     STEP_S,

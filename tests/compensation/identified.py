@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from markers.bootstrap import disc_sizes_px, find_candidates
-from markers.grid import DetectionError, identify
-from markers.target import Target
 from tests.compensation.rendered import Float, Scene, project, true_centres_px
+from thermostand.markers.bootstrap import disc_sizes_px, find_candidates
+from thermostand.markers.grid import DetectionError, identify
+from thermostand.markers.target import Target
 
 CLUTTER_DISCS = 20
 NEAR_px = 4.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.drift.facts import ModelFacts
-from compensation.drift.paper_model import DegreeScore, PaperModel
-from compensation.drift.polynomial import exponents
-from compensation.drift.terms import Kind, Term
-from compensation.drift.thermal_model import ThermalModel, ThermalRange
+from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel
+from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.drift.terms import Kind, Term
+from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange
 
 SIZE = (640, 480)
 HULL = np.array([[50.0, 40.0], [600.0, 40.0], [600.0, 440.0], [50.0, 440.0]])

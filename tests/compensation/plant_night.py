@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.thermal_history import History, refined
-from compensation.observations import Observations, SessionFacts
-from drivers.camera_preset import CameraPreset, Effect
-from drivers.sim.physics.optics import CameraKind, true_centres_px
-from drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
-from drivers.sim.physics.published_camera import PublishedCamera
-from foundation.documents import load_document
+from thermostand.compensation.history.thermal_history import History, refined
+from thermostand.compensation.observations import Observations, SessionFacts
+from thermostand.drivers.camera_preset import CameraPreset, Effect
+from thermostand.drivers.sim.physics.optics import CameraKind, true_centres_px
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
+from thermostand.drivers.sim.physics.published_camera import PublishedCamera
+from thermostand.foundation.documents import load_document
 
 from .synthetic import SIZE, TARGET
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.history.thermal_history import History
-from compensation.observations import Observations
+from thermostand.compensation.history.thermal_history import History
+from thermostand.compensation.observations import Observations
 
 from .synthetic import SIZE, TARGET, facts
 

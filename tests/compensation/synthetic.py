@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.observations import Observations, SessionFacts
-from markers.target import Target
+from thermostand.compensation.observations import Observations, SessionFacts
+from thermostand.markers.target import Target
 
 Float = NDArray[np.float64]
 Drift = Callable[[Float, float], Float]

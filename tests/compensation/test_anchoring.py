@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.anchoring import anchored
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.paper_fit import fit_paper
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.observations import Float
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.drift.anchoring import anchored
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Float
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 from .drawn_cameras import drawn_camera
 from .drawn_nights import Night, cycle, night, reference, warm_up

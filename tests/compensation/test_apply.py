@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.cli import app
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.training import frame_states
-from compensation.history.thermal_history import recorded_history, states_at
-from compensation.observations import observe, session_target
-from experiments.steps import Role
-from markers.detection import detect
-from recording.reading.session import Session
+from thermostand.compensation.cli import app
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.thermal_history import recorded_history, states_at
+from thermostand.compensation.observations import observe, session_target
+from thermostand.experiments.steps import Role
+from thermostand.markers.detection import detect
+from thermostand.recording.reading.session import Session
 
 from .conftest import Recorded
 from .made_up_models import paper, thermal

@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation import cli
-from compensation.budget.budget import Budget, budget
-from compensation.budget.correction import displacement_px, granite_mm, post_mm, varied
-from compensation.budget.geometry import Geometry, StandTemperatures, load_geometry
-from compensation.budget.repeatability import home_residuals
-from compensation.budget.session_temperatures import mean_state
-from drivers.sim.physics import optics
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepMark, StepState
-from foundation.readings import Frame, Reading
-from markers.target import load_target
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
-from stand.config.stand_config import packaged
+from thermostand.compensation import cli
+from thermostand.compensation.budget.budget import Budget, budget
+from thermostand.compensation.budget.correction import displacement_px, granite_mm, post_mm, varied
+from thermostand.compensation.budget.geometry import Geometry, StandTemperatures, load_geometry
+from thermostand.compensation.budget.repeatability import home_residuals
+from thermostand.compensation.budget.session_temperatures import mean_state
+from thermostand.drivers.sim.physics import optics
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.markers.target import load_target
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.stand.config.stand_config import packaged
 
 from .rendered import Scene, photograph, render
 

@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.drift.bump import Bump
-from compensation.drift.bumps import find_bumps
-from compensation.observations import Observations
-from experiments.steps import Role
 from tests.compensation import plant_night
 from tests.compensation.drawn_cameras import REPEATING, drawn_camera
 from tests.compensation.drawn_nights import followed_cycle, full_night, night, reference, warm_up
+from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.bumps import find_bumps
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
 
 FIRST, NIGHTS = 70_000, 100
 MOST_FALSE = 3

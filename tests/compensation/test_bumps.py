@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.bumps import find_bumps
-from compensation.drift.choosing import fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import evaluate
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.training import frame_states
-from compensation.observations import Mask, Observations
-from compensation.reporting.report import write_report
-from experiments.steps import Role
 from tests.nightly import by_night
+from thermostand.compensation.drift.bumps import find_bumps
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import evaluate
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Mask, Observations
+from thermostand.compensation.reporting.report import write_report
+from thermostand.experiments.steps import Role
 
 from .drawn_cameras import drawn_camera
 from .drawn_nights import START_NS, Bump, Night, followed_cycle, full_night, night, reference, warm_up

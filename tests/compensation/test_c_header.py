@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import pytest
 
-from compensation.apply.c_header import export_c, header_text
-from compensation.apply.compensate_images import warp
-from compensation.apply.runtime_export import runtime_model
-from compensation.drift.choosing import fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift_runtime import AMBIENT, CAMERA, HISTORY, STATE, SWITCHED_ON, Drift
-from foundation.errors import ConfigError
 from tests.nightly import by_night
+from thermostand.compensation.apply.c_header import export_c, header_text
+from thermostand.compensation.apply.compensate_images import warp
+from thermostand.compensation.apply.runtime_export import runtime_model
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift_runtime import AMBIENT, CAMERA, HISTORY, STATE, SWITCHED_ON, Drift
+from thermostand.foundation.errors import ConfigError
 
 from .compiled_header import COMPILER, STRICT, Float, compiled, said
 from .drawn_cameras import drawn_camera

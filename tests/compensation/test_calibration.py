@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.calibration.adjustment import Adjustment, adjust
-from compensation.calibration.calibrate import Model, calibrate
-from compensation.calibration.camera_file import camera_file
-from compensation.calibration.model_scores import BROWN, best, halves, rays_of
-from compensation.calibration.opencv import calibrate_opencv
-from compensation.calibration.pose import find_pose
-from compensation.calibration.seen_area import NOT_SEEN
-from compensation.calibration.stage_geometry import TableSigma
-from compensation.calibration.uncertainty import difference, projection_uncertainty
-from compensation.commands.calibration_cli import summary
-from compensation.reporting.calibration_report import report_page
-from compensation.validation3d.validate import LensModel, camera_of
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.adjustment import Adjustment, adjust
+from thermostand.compensation.calibration.calibrate import Model, calibrate
+from thermostand.compensation.calibration.camera_file import camera_file
+from thermostand.compensation.calibration.model_scores import BROWN, best, halves, rays_of
+from thermostand.compensation.calibration.opencv import calibrate_opencv
+from thermostand.compensation.calibration.pose import find_pose
+from thermostand.compensation.calibration.seen_area import NOT_SEEN
+from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.compensation.calibration.uncertainty import difference, projection_uncertainty
+from thermostand.compensation.commands.calibration_cli import summary
+from thermostand.compensation.reporting.calibration_report import report_page
+from thermostand.compensation.validation3d.validate import LensModel, camera_of
+from thermostand.foundation.errors import CalibrationError
 
 from .calibration_cases import CENTRE_mm, board, covariances, positions, target_of, translation_errors_um
 from .calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw

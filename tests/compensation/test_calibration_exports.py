@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
-from compensation.calibration.pinhole import Pinhole
-from foundation.errors import SessionError
+from thermostand.compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
+from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.foundation.errors import SessionError
 
 SIZE = (2448, 2048)
 BROWN = Pinhole(np.array([7246.1234567, 7251.7, 1231.8, 1015.4, -0.12, 0.35, 2e-4, -3e-4, 0.7]), SIZE)

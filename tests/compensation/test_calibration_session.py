@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from compensation import cli
-from compensation.calibration.camera_file import load_camera
-from compensation.calibration.pose import find_pose
-from compensation.calibration.session_centres import observe_positions
-from compensation.observations import session_target
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.errors import CalibrationError, SessionError
-from foundation.hub import Hub
-from foundation.items import Batch, StepMark, StepState
-from foundation.readings import Frame, Quality, Reading
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.compensation import cli
+from thermostand.compensation.calibration.camera_file import load_camera
+from thermostand.compensation.calibration.pose import find_pose
+from thermostand.compensation.calibration.session_centres import observe_positions
+from thermostand.compensation.observations import session_target
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.errors import CalibrationError, SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, StepMark, StepState
+from thermostand.foundation.readings import Frame, Quality, Reading
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import yaml
 
-from compensation.calibration.adjustment import adjust
-from compensation.calibration.board import board_of
-from compensation.calibration.model_scores import rays_of
-from compensation.calibration.pose import find_pose
-from compensation.calibration.session_centres import Positions
-from compensation.calibration.stage_geometry import TableSigma
-from drivers.sim.physics.optics import Nodes, Optics, Placement, optics_at, true_centres_px
-from markers.target import load_target
-from stand.config.stand_config import packaged
+from thermostand.compensation.calibration.adjustment import adjust
+from thermostand.compensation.calibration.board import board_of
+from thermostand.compensation.calibration.model_scores import rays_of
+from thermostand.compensation.calibration.pose import find_pose
+from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.drivers.sim.physics.optics import Nodes, Optics, Placement, optics_at, true_centres_px
+from thermostand.markers.target import load_target
+from thermostand.stand.config.stand_config import packaged
 
 NOISE_px = 0.0012  # the mean of five frames
 WARM = Nodes(43.0, 39.0, 38.0, 24.0, 24.25, 24.2)  # after hours in a chamber at 24 degC

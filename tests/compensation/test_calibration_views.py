@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.calibration.board import Board
-from compensation.calibration.exports import EXPORTS
-from compensation.calibration.seen_area import NOT_SEEN
-from compensation.calibration.view_uncertainty import known, projection_sigma_um
-from compensation.calibration.views import ViewCalibration, Views, calibrate_views, cross_validated_px
-from compensation.cli import app
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.exports import EXPORTS
+from thermostand.compensation.calibration.seen_area import NOT_SEEN
+from thermostand.compensation.calibration.view_uncertainty import known, projection_sigma_um
+from thermostand.compensation.calibration.views import ViewCalibration, Views, calibrate_views, cross_validated_px
+from thermostand.compensation.cli import app
+from thermostand.foundation.errors import CalibrationError
 
 from .calibration_cases import board
 from .calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation import cli
-from compensation.centres_table import observations_of_table
-from compensation.drift.model_file import load_model
-from compensation.drift_runtime import Drift
-from foundation.errors import SessionError
+from thermostand.compensation import cli
+from thermostand.compensation.centres_table import observations_of_table
+from thermostand.compensation.drift.model_file import load_model
+from thermostand.compensation.drift_runtime import Drift
+from thermostand.foundation.errors import SessionError
 
 from .drawn_cameras import drawn_camera
 from .drawn_nights import full_night, night

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.finding.piece import FoundMarkers, find_markers, joined, pieces_of
-from compensation.observations import session_target
-from recording.reading.session import Session
+from thermostand.compensation.finding.piece import FoundMarkers, find_markers, joined, pieces_of
+from thermostand.compensation.observations import session_target
+from thermostand.recording.reading.session import Session
 
 from .cluster_week import CAMERAS, week
 from .conftest import Recorded

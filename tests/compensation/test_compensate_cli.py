@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from compensation import cli
-from compensation.drift.evaluation import table
-from compensation.drift.model_file import load_model
-from compensation.drift.paper_model import PaperModel
-from compensation.reporting.report import analyse
-from foundation.errors import SessionError
-from foundation.progress import progress
-from markers.detections_table import COLUMNS
+from thermostand.compensation import cli
+from thermostand.compensation.drift.evaluation import table
+from thermostand.compensation.drift.model_file import load_model
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.reporting.report import analyse
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.progress import progress
+from thermostand.markers.detections_table import COLUMNS
 
 from .conftest import DARK, SEQUENCE, TARGET_YAML, Recorded, photo
 
@@ -215,8 +215,8 @@ def test_an_interrupted_command_leaves_older_files_as_they_were(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("compensation.finding.piece.detect", interrupted)
-    monkeypatch.setattr("compensation.commands.detect_cli.detect", interrupted)
+    monkeypatch.setattr("thermostand.compensation.finding.piece.detect", interrupted)
+    monkeypatch.setattr("thermostand.compensation.commands.detect_cli.detect", interrupted)
     for command in ("detect", "fit", "report"):
         out = tmp_path / command
         out.write_text("older")

@@ -8,22 +8,22 @@ from pathlib import Path
 import pytest
 from numba.core.event import RecordingListener, install_listener
 
-from foundation.documents import parse_document
-from markers import compiled
-from markers.compile_ahead import compile_ahead
-from markers.compiled import digest
-from markers.detection import Flag, detect
-from markers.target import Target
-from recording.format.images import encode_png
 from tests.compensation.conftest import GLARE, TARGET_YAML, photo
+from thermostand.foundation.documents import parse_document
+from thermostand.markers import compiled
+from thermostand.markers.compile_ahead import compile_ahead
+from thermostand.markers.compiled import digest
+from thermostand.markers.detection import Flag, detect
+from thermostand.markers.target import Target
+from thermostand.recording.format.images import encode_png
 
 PROGRAM = """
-from markers.compiled import entry
+from thermostand.markers.compiled import entry
 from thing import twice
 print(twice(21), len(twice.stats.cache_hits))
 """
 THING = """
-from markers.compiled import entry
+from thermostand.markers.compiled import entry
 @entry
 def twice(x):
     return 2 * x
@@ -72,7 +72,7 @@ def test_what_is_compiled_is_said_once_per_machine_and_no_part_of_the_time_left(
     command = [
         sys.executable,
         "-m",
-        "compensation.cli",
+        "thermostand.compensation.cli",
         "detect",
         picture,
         "--target",

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from markers.band import NARROW_SIGMA, WIDE_SIGMA
-from markers.detection import Detection, detect
-from markers.sandwich import variance_growth, variance_ratio
 from tests.nightly import by_night
+from thermostand.markers.band import NARROW_SIGMA, WIDE_SIGMA
+from thermostand.markers.detection import Detection, detect
+from thermostand.markers.sandwich import variance_growth, variance_ratio
 
 from .rendered import Float, render, true_centres_px
 from .spoiled import (

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.cli import app
-from compensation.datasheet.datasheet import Datasheet, datasheet
-from compensation.datasheet.details import Details, load_details
-from compensation.datasheet.motions import Visits, Warming, motions
-from compensation.datasheet.quantity import NIGHTS, Contribution, Quantity, direct, pooled
-from compensation.datasheet.warming import frame_noise, warming_quantities
-from compensation.drift.choosing import fit
-from compensation.drift.paper_fit import fit_paper
-from compensation.observations import Observations
-from compensation.reporting.datasheet_page import datasheet_json, datasheet_page
-from compensation.reporting.numbers import compact, measured, percent, significant
-from foundation.errors import ConfigError
+from thermostand.compensation.cli import app
+from thermostand.compensation.datasheet.datasheet import Datasheet, datasheet
+from thermostand.compensation.datasheet.details import Details, load_details
+from thermostand.compensation.datasheet.motions import Visits, Warming, motions
+from thermostand.compensation.datasheet.quantity import NIGHTS, Contribution, Quantity, direct, pooled
+from thermostand.compensation.datasheet.warming import frame_noise, warming_quantities
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.observations import Observations
+from thermostand.compensation.reporting.datasheet_page import datasheet_json, datasheet_page
+from thermostand.compensation.reporting.numbers import compact, measured, percent, significant
+from thermostand.foundation.errors import ConfigError
 
 from .conftest import Recorded
 from .drawn_cameras import Camera, Float, centres_px, drawn_camera, settled_degC

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.design.courses import Known, best_course
-from compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
-from compensation.design.next_visit import Decision, Wanted, decide
-from compensation.design.wanted_states import wanted_states
-from compensation.drift.training import frame_states
-from compensation.history.states import Float, Memory
-from compensation.observations import Observations
+from thermostand.compensation.design.courses import Known, best_course
+from thermostand.compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
+from thermostand.compensation.design.next_visit import Decision, Wanted, decide
+from thermostand.compensation.design.wanted_states import wanted_states
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.observations import Observations
 
 from .drawn_cameras import drawn_camera
 from .drawn_nights import Stretch, night, reference, warm_up

@@ -2,8 +2,8 @@
 
 import multiprocessing
 
-from compensation.reporting.drawing.drawing import drawing, one_by_one
-from compensation.reporting.drawing.figures import new_figure
+from thermostand.compensation.reporting.drawing.drawing import drawing, one_by_one
+from thermostand.compensation.reporting.drawing.figures import new_figure
 
 
 def test_two_processes_draw_the_same_bytes():

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.displacements import displacements
-from compensation.drift.facts import ModelFacts
-from compensation.drift.hull import convex_hull
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.paper_fit import choose, fit_paper
-from compensation.drift.paper_model import DegreeScore, PaperModel
-from compensation.drift.polynomial import condense, design, solve
-from compensation.history.states import States
-from compensation.observations import Observations, concatenate
-from experiments.steps import Role
-from foundation.errors import ConfigError, SessionError
-from foundation.files import write_whole
+from thermostand.compensation.drift.displacements import displacements
+from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.hull import convex_hull
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.paper_fit import choose, fit_paper
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel
+from thermostand.compensation.drift.polynomial import condense, design, solve
+from thermostand.compensation.history.states import States
+from thermostand.compensation.observations import Observations, concatenate
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.files import write_whole
 
 from .synthetic import CAMERA_ABOVE_CHAMBER_K, FIT_DEGC, facts, observations, places_px, polynomial_drift, quadratic
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from markers.detection import detect, nothing_found
-from markers.eccentricity import disc_centres, disc_centres_px, ellipse_centre_offset_px
-from markers.target import load_target
+from thermostand.markers.detection import detect, nothing_found
+from thermostand.markers.eccentricity import disc_centres, disc_centres_px, ellipse_centre_offset_px
+from thermostand.markers.target import load_target
 
 from .rendered import Scene, photograph, project, render, true_centres_px
 

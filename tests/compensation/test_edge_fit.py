@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from markers import edge_fit
-from markers.edge_fit import EdgeFit, Flag, fit_edges
-from markers.edge_model import (
+from tests.nightly import by_night
+from thermostand.markers import edge_fit
+from thermostand.markers.edge_fit import EdgeFit, Flag, fit_edges
+from thermostand.markers.edge_model import (
     B0,
     BX,
     BY,
@@ -30,9 +31,21 @@ from markers.edge_model import (
     normal_distribution,
     normal_equations,
 )
-from markers.noise import Noise
-from markers.pixels import CORE, DISC, GROUND, SHARE, VALUE, Limits, Pixels, U, V, empty_pixels, gather, picture_of
-from tests.nightly import by_night
+from thermostand.markers.noise import Noise
+from thermostand.markers.pixels import (
+    CORE,
+    DISC,
+    GROUND,
+    SHARE,
+    VALUE,
+    Limits,
+    Pixels,
+    U,
+    V,
+    empty_pixels,
+    gather,
+    picture_of,
+)
 
 from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
 

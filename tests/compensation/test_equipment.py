@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from compensation.reporting.equipment import equipment_of
-from foundation.items import Event
+from thermostand.compensation.reporting.equipment import equipment_of
+from thermostand.foundation.items import Event
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.drift.evaluation import evaluate, improvement_percent, table
-from compensation.drift.paper_fit import fit_paper
-from compensation.drift.paper_model import PaperModel
-from compensation.observations import Observations
-from foundation.errors import SessionError
+from thermostand.compensation.drift.evaluation import evaluate, improvement_percent, table
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.observations import Observations
+from thermostand.foundation.errors import SessionError
 
 from .synthetic import HELD_OUT_DEGC, facts, observations, places_px, quadratic
 

@@ -7,13 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from compensation.drift.choosing import fit
-from compensation.drift.drift_model import Outside
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.observations import Float
-from experiments.steps import Role
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.drift_model import Outside
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Float
+from thermostand.experiments.steps import Role
 
 from .drawn_cameras import drawn_camera
 from .drawn_nights import Night, Stretch, cycle, night, reference, warm_up

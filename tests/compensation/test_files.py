@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from foundation.files import check_folder_writable, check_writable, make_folder, whole_file, write_whole
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import check_folder_writable, check_writable, make_folder, whole_file, write_whole
 
 
 @pytest.fixture

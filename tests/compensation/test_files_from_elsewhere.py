@@ -20,12 +20,12 @@ import pytest
 from typer.testing import CliRunner
 
 import thermostand
-from compensation import cli
-from compensation.apply.runtime_export import runtime_model
-from compensation.calibration.calibrate import Model, calibrate
-from compensation.calibration.camera_file import camera_file
-from compensation.drift.drift_model import DriftModel
-from compensation.drift_runtime import Drift
+from thermostand.compensation import cli
+from thermostand.compensation.apply.runtime_export import runtime_model
+from thermostand.compensation.calibration.calibrate import Model, calibrate
+from thermostand.compensation.calibration.camera_file import camera_file
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift_runtime import Drift
 
 from .calibration_cases import positions, target_of
 from .calibration_truth import Truth, draw

@@ -17,17 +17,17 @@ import numpy as np
 import psutil
 import pytest
 
-from compensation.finding.cache import keep, kept
-from compensation.finding.finder import Finder, finder
-from compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
-from compensation.finding.workers import find_to_file, in_processes, in_turn, on_cluster
-from compensation.observations import session_target
-from foundation.errors import ConfigError, SessionError
-from markers.detection import detect
-from markers.noise import Noise
-from recording.format.mcap_bytes import RECORD
-from recording.format.records import frame_places
-from recording.reading.session import Session
+from thermostand.compensation.finding.cache import keep, kept
+from thermostand.compensation.finding.finder import Finder, finder
+from thermostand.compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
+from thermostand.compensation.finding.workers import find_to_file, in_processes, in_turn, on_cluster
+from thermostand.compensation.observations import session_target
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.markers.detection import detect
+from thermostand.markers.noise import Noise
+from thermostand.recording.format.mcap_bytes import RECORD
+from thermostand.recording.format.records import frame_places
+from thermostand.recording.reading.session import Session
 
 from .conftest import TARGET_YAML, Recorded, record
 
@@ -120,7 +120,7 @@ def test_what_a_process_answers_fits_into_one_write_of_a_pipe(
 
 OWNER = """if True:
     import os, time
-    from compensation.finding.workers import pool
+    from thermostand.compensation.finding.workers import pool
     if __name__ == "__main__":
         with pool(1) as processes:
             print(processes.submit(os.getpid).result(), flush=True)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from markers.bootstrap import Candidates
-from markers.grid import DetectionError, Identified, identify, roll_deg
-from markers.placement import placements
-from markers.target import OddMarker, Target, load_target
 from tests.nightly import by_night
+from thermostand.markers.bootstrap import Candidates
+from thermostand.markers.grid import DetectionError, Identified, identify, roll_deg
+from thermostand.markers.placement import placements
+from thermostand.markers.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, true_centres_px
 

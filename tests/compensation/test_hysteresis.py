@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from compensation.drift.hysteresis import hysteresis
-from compensation.drift.paper_fit import fit_paper
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.observations import Observations
+from thermostand.compensation.drift.hysteresis import hysteresis
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.observations import Observations
 
 from .reservoirs import cycle, reference, session, warm_up
 from .synthetic import FIT_DEGC, observations, places_px, quadratic

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from markers.detection import detect
-from markers.target import load_target
-from stand.config.stand_config import packaged
 from tests.compensation.identified import TARGETS, judged, own, posed
 from tests.compensation.rendered import photograph, render, true_centres_px
+from thermostand.markers.detection import detect
+from thermostand.markers.target import load_target
+from thermostand.stand.config.stand_config import packaged
 
 PAPER = load_target(packaged("targets", "paper-9x6"))
 

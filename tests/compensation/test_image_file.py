@@ -17,13 +17,13 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from typer.testing import CliRunner
 
-from compensation.cli import app
-from compensation.finding.png_rows import decode_rows
-from foundation.errors import SessionError
-from foundation.image_limit import images_up_to
-from markers.detection import DetectionError
-from markers.image_file import read_image
-from recording.format.images import SIGNATURE, decode_image
+from thermostand.compensation.cli import app
+from thermostand.compensation.finding.png_rows import decode_rows
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.image_limit import images_up_to
+from thermostand.markers.detection import DetectionError
+from thermostand.markers.image_file import read_image
+from thermostand.recording.format.images import SIGNATURE, decode_image
 
 LIMIT_S = 120
 MOST_BYTES = 1_500_000_000
@@ -137,7 +137,7 @@ def test_the_largest_images_take_less_memory_than_a_small_computer_has(tmp_path:
     cv2.imwrite(str(path), image)
     code = f"""if True:
         import resource, sys
-        from compensation.cli import app
+        from thermostand.compensation.cli import app
         try:
             app(["detect", {str(path)!r}, "-o", {str(tmp_path / "m.csv")!r}])
         finally:

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from compensation.cli import app
-from compensation.drift.model_file import save_model
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_session
+from thermostand.compensation.cli import app
+from thermostand.compensation.drift.model_file import save_model
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_session
 
 from .conftest import SEQUENCE, Recorded
 from .made_up_models import paper

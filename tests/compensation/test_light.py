@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from markers.edge_fit import EdgeFit, fit_edges
-from markers.light import under_common_light
-from markers.noise import Noise
-from markers.pixels import picture_of
+from thermostand.markers.edge_fit import EdgeFit, fit_edges
+from thermostand.markers.light import under_common_light
+from thermostand.markers.noise import Noise
+from thermostand.markers.pixels import picture_of
 
 from .rendered import Float, Scene, photograph, render, shaded_light, true_centres_px
 from .test_edge_fit import rms_mpx, start_from

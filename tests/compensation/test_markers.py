@@ -14,12 +14,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from foundation.errors import SessionError
-from markers.detection import Detection, DetectionError, Flag, Noise, detect, follow, grey_image, rows_to_follow
-from markers.detections_table import COLUMNS, DetectedImage, flags_text, write_detections
-from markers.eccentricity import disc_centres
-from markers.image_file import read_image
-from markers.target import OddMarker, Target, load_target
+from thermostand.foundation.errors import SessionError
+from thermostand.markers.detection import (
+    Detection,
+    DetectionError,
+    Flag,
+    Noise,
+    detect,
+    follow,
+    grey_image,
+    rows_to_follow,
+)
+from thermostand.markers.detections_table import COLUMNS, DetectedImage, flags_text, write_detections
+from thermostand.markers.eccentricity import disc_centres
+from thermostand.markers.image_file import read_image
+from thermostand.markers.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, photograph, render, true_centres_px
 

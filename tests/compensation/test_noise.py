@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from markers.noise import _order, estimate_noise, full_scale_DN
 from tests.nightly import by_night
+from thermostand.markers.noise import _order, estimate_noise, full_scale_DN
 
 from .rendered import Scene, photograph, render, shaded_light
 

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.displacements import displacements, reference_centres
-from compensation.observations import Observations, concatenate, observe_session, session_target
-from experiments.steps import Role
-from foundation.clock import NS_PER_S
-from foundation.errors import ConfigError, SessionError
-from foundation.instants import local_text
-from markers.detection import Flag
-from recording.format.records import frame_places
-from recording.format.restarts import restarted
-from recording.reading.session import Session
+from thermostand.compensation.drift.displacements import displacements, reference_centres
+from thermostand.compensation.observations import Observations, concatenate, observe_session, session_target
+from thermostand.experiments.steps import Role
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.instants import local_text
+from thermostand.markers.detection import Flag
+from thermostand.recording.format.records import frame_places
+from thermostand.recording.format.restarts import restarted
+from thermostand.recording.reading.session import Session
 
 from .conftest import DARK, GLARE, SEQUENCE, START_NS, TARGET_YAML, Recorded, record
 from .synthetic import facts, observations, quadratic

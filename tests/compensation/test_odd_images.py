@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from markers.bootstrap import Candidates
-from markers.detection import DetectionError, detect
-from markers.grid import identify
-from markers.plane import fit_homography, project
-from markers.target import load_target
-from stand.config.stand_config import packaged
+from thermostand.markers.bootstrap import Candidates
+from thermostand.markers.detection import DetectionError, detect
+from thermostand.markers.grid import identify
+from thermostand.markers.plane import fit_homography, project
+from thermostand.markers.target import load_target
+from thermostand.stand.config.stand_config import packaged
 
 TARGET = load_target(packaged("targets", "paper-9x6"))
 LONGEST_CPU_S = 30.0

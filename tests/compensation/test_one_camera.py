@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.cli import app
-from compensation.drift.facts import ModelFacts
-from compensation.drift.model_file import save_model
-from compensation.drift.paper_model import DegreeScore, PaperModel
-from compensation.drift.polynomial import exponents
-from compensation.history.thermal_history import recorded_history
-from compensation.observations import observe
-from compensation.one_camera import name_of, own_frames, take
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Batch, Item
-from foundation.readings import Frame, Reading
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.compensation.cli import app
+from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.model_file import save_model
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel
+from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.history.thermal_history import recorded_history
+from thermostand.compensation.observations import observe
+from thermostand.compensation.one_camera import name_of, own_frames, take
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Item
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .conftest import START_NS, TARGET_YAML, published
 

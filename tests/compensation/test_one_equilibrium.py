@@ -6,14 +6,14 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from compensation.cli import app
-from compensation.one_equilibrium import check_one_equilibrium
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import Event, StepMark, StepState
-from recording.format.restarts import restarted
-from recording.reading.session import Session
 from tests.recording.recorded import START_NS, frame, record
+from thermostand.compensation.cli import app
+from thermostand.compensation.one_equilibrium import check_one_equilibrium
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.recording.format.restarts import restarted
+from thermostand.recording.reading.session import Session
 
 
 def items(gap_index: int, *, superseded: bool = False, role: str = "fit"):

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation.cli import app
-from compensation.commands import detect_cli
-from markers.detection import Detection, detect
-from markers.grid import project
-from markers.image_file import read_image
-from markers.target import load_target
 from tests.nightly import by_night
+from thermostand.compensation.cli import app
+from thermostand.compensation.commands import detect_cli
+from thermostand.markers.detection import Detection, detect
+from thermostand.markers.grid import project
+from thermostand.markers.image_file import read_image
+from thermostand.markers.target import load_target
 
 ROOT = Path(__file__).parents[2]
 TARGET = load_target(ROOT / "configs" / "targets" / "robot-cal-tools-10x10.yaml")

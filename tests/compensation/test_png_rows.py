@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from compensation.finding import png_rows
-from compensation.finding.png_rows import decode_rows
-from foundation.errors import SessionError
-from recording.format.images import check_strip, decode_png, encode_png, strip_places
 from tests.recording.test_strips import with_index
+from thermostand.compensation.finding import png_rows
+from thermostand.compensation.finding.png_rows import decode_rows
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.images import check_strip, decode_png, encode_png, strip_places
 
 FILTERS = {
     "none": cv2.IMWRITE_PNG_FILTER_NONE,

@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import compensation
-import markers
-import recording
 import thermostand
-from compensation.drift.training import frame_states
-from compensation.history.states import Memory
-from compensation.history.thermal_history import History, states_at
-from experiments.steps import Role
+from thermostand import compensation, markers, recording
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.states import Memory
+from thermostand.compensation.history.thermal_history import History, states_at
+from thermostand.experiments.steps import Role
 
 from .conftest import Recorded
 from .test_calibration_session import record as record_calibration
@@ -71,7 +69,7 @@ def test_a_name_of_thermostand_is_that_of_its_package():
 def test_one_import_is_enough_and_light():
     code = (
         "import sys, thermostand\n"
-        "assert not {'numpy', 'recording.reading', 'numba', 'cv2'} & {*sys.modules}\n"
+        "assert not {'numpy', 'thermostand.recording.reading', 'numba', 'cv2'} & {*sys.modules}\n"
         "thermostand.Session\n"
         "assert not {'numba', 'scipy', 'cv2', 'matplotlib'} & {*sys.modules}"
     )

@@ -12,26 +12,26 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from compensation.budget.budget import Budget, Contribution
-from compensation.budget.geometry import StandTemperatures
-from compensation.drift.evaluation import Evaluation, evaluate
-from compensation.drift.paper_fit import fit_paper
-from compensation.drift.paper_model import PaperModel
-from compensation.drift.terms import Origin, features
-from compensation.history.states import States
-from compensation.observations import Observations
-from compensation.reporting.compensation_section import uncertainty_section
-from compensation.reporting.data_section import data_section
-from compensation.reporting.drawing.figures import enlarged
-from compensation.reporting.drawing.fit_figures import measured_against_model
-from compensation.reporting.extras import Extras
-from compensation.reporting.formula import formula_of
-from compensation.reporting.gather import numbers_of
-from compensation.reporting.numbers import Numbers, as_json
-from compensation.reporting.page import page as page_of
-from compensation.reporting.report import can_be_fitted, check_report_writable, report_page, write_report
-from compensation.reporting.result_section import result_section
-from foundation.errors import SessionError
+from thermostand.compensation.budget.budget import Budget, Contribution
+from thermostand.compensation.budget.geometry import StandTemperatures
+from thermostand.compensation.drift.evaluation import Evaluation, evaluate
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.terms import Origin, features
+from thermostand.compensation.history.states import States
+from thermostand.compensation.observations import Observations
+from thermostand.compensation.reporting.compensation_section import uncertainty_section
+from thermostand.compensation.reporting.data_section import data_section
+from thermostand.compensation.reporting.drawing.figures import enlarged
+from thermostand.compensation.reporting.drawing.fit_figures import measured_against_model
+from thermostand.compensation.reporting.extras import Extras
+from thermostand.compensation.reporting.formula import formula_of
+from thermostand.compensation.reporting.gather import numbers_of
+from thermostand.compensation.reporting.numbers import Numbers, as_json
+from thermostand.compensation.reporting.page import page as page_of
+from thermostand.compensation.reporting.report import can_be_fitted, check_report_writable, report_page, write_report
+from thermostand.compensation.reporting.result_section import result_section
+from thermostand.foundation.errors import SessionError
 
 from .made_up_models import thermal
 from .synthetic import facts, observations, places_px, quadratic

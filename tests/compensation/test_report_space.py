@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.reporting.extras import Extras
-from compensation.reporting.gather import numbers_of
-from compensation.reporting.page import page as page_of
-from compensation.reporting.report import report_page, space_section
-from compensation.reporting.table_positions import TablePositions, table_positions
-from compensation.validation3d.deviations import Deviations
-from compensation.validation3d.document import as_json, load_validation
-from compensation.validation3d.validate import Validation
-from foundation.errors import SessionError
-from foundation.items import StepMark, StepState
+from thermostand.compensation.reporting.extras import Extras
+from thermostand.compensation.reporting.gather import numbers_of
+from thermostand.compensation.reporting.page import page as page_of
+from thermostand.compensation.reporting.report import report_page, space_section
+from thermostand.compensation.reporting.table_positions import TablePositions, table_positions
+from thermostand.compensation.validation3d.deviations import Deviations
+from thermostand.compensation.validation3d.document import as_json, load_validation
+from thermostand.compensation.validation3d.validate import Validation
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import StepMark, StepState
 
 from .synthetic import TARGET, observations, quadratic
 

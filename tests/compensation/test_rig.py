@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from compensation.calibration.board import Board
-from compensation.calibration.rig import RigCalibration, calibrate_rig
-from compensation.calibration.views import Views
-from compensation.cli import app
-from foundation.errors import CalibrationError
+from thermostand.compensation.calibration.board import Board
+from thermostand.compensation.calibration.rig import RigCalibration, calibrate_rig
+from thermostand.compensation.calibration.views import Views
+from thermostand.compensation.cli import app
+from thermostand.foundation.errors import CalibrationError
 
 from .rendered import Scene, photograph, render
 

@@ -16,9 +16,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from compensation.apply.ros2_package import export_ros2
-from compensation.apply.runtime_export import runtime_model
-from compensation.drift_runtime import Drift
+from thermostand.compensation.apply.ros2_package import export_ros2
+from thermostand.compensation.apply.runtime_export import runtime_model
+from thermostand.compensation.drift_runtime import Drift
 
 from .made_up_models import thermal
 from .ros2_stub import MESSAGES, Header, Point32, Polygon, StubNode, Time, stub_modules

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.apply.runtime_export import export, runtime_model
-from compensation.drift.drift_model import DriftModel, Outside
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift_runtime import Drift
-from compensation.history.states import States, row_of, state_of
-from foundation.errors import SessionError
+from thermostand.compensation.apply.runtime_export import export, runtime_model
+from thermostand.compensation.drift.drift_model import DriftModel, Outside
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift_runtime import Drift
+from thermostand.compensation.history.states import States, row_of, state_of
+from thermostand.foundation.errors import SessionError
 
 from .made_up_models import LIFE, MODELS, POINTS, paper, thermal
 

@@ -7,10 +7,10 @@ from functools import cache
 
 import numpy as np
 
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.observations import concatenate
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import concatenate
 
 from .drawn_cameras import drawn_camera
 from .drawn_nights import Night, full_night, night

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from markers.target import Target, load_target
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.markers.target import Target, load_target
 
 TARGETS = Path(__file__).parents[2] / "configs" / "targets"
 SMALL = "name: small\ncolumns: 4\nrows: 3\npitch_mm: 10\ndiameter_mm: 4\n"

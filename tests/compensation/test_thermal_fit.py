@@ -9,22 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.choosing import better, fit
-from compensation.drift.drift_model import DriftModel, Outside
-from compensation.drift.evaluation import evaluate
-from compensation.drift.facts import ModelFacts
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.paper_fit import fit_paper
-from compensation.drift.paper_model import PaperModel
-from compensation.drift.terms import Kind
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.history.states import States, row_of, state_of
-from compensation.history.thermal_history import states_at
-from compensation.observations import Observations, concatenate
-from experiments.steps import Role
-from foundation.errors import ConfigError, SessionError
+from thermostand.compensation.drift.choosing import better, fit
+from thermostand.compensation.drift.drift_model import DriftModel, Outside
+from thermostand.compensation.drift.evaluation import evaluate
+from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.terms import Kind
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.history.states import States, row_of, state_of
+from thermostand.compensation.history.thermal_history import states_at
+from thermostand.compensation.observations import Observations, concatenate
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import ConfigError, SessionError
 
 from .reservoirs import Part, cycle, reference, session, warm_up
 from .synthetic import observations as without_histories

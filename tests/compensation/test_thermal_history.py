@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.drift_runtime import ThermalState
-from compensation.history.states import Memory, States, row_of, state_of
-from compensation.history.thermal_history import History, refined, states_at
+from thermostand.compensation.drift_runtime import ThermalState
+from thermostand.compensation.history.states import Memory, States, row_of, state_of
+from thermostand.compensation.history.thermal_history import History, refined, states_at
 
 S = 1_000_000_000
 MEMORY = Memory((600.0, 3600.0), (2.0,), 20.0)

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compensation.history.thermal_history import History
-from compensation.observations import Observations, concatenate
-from compensation.reporting.drawing import drift_figures
-from compensation.reporting.drawing.figures import as_svg
-from compensation.reporting.drawing.path_figures import Paths, trajectories
-from compensation.reporting.tracks import cycle, moved_px, thinned, visits, warm_ups
-from experiments.steps import Role
+from thermostand.compensation.history.thermal_history import History
+from thermostand.compensation.observations import Observations, concatenate
+from thermostand.compensation.reporting.drawing import drift_figures
+from thermostand.compensation.reporting.drawing.figures import as_svg
+from thermostand.compensation.reporting.drawing.path_figures import Paths, trajectories
+from thermostand.compensation.reporting.tracks import cycle, moved_px, thinned, visits, warm_ups
+from thermostand.experiments.steps import Role
 
 from .synthetic import Float, facts, observations, places_px, quadratic
 

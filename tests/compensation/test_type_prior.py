@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.evaluation import rms_px
-from compensation.drift.model_file import load_model, save_model
-from compensation.drift.thermal_learning import fit_thermal
-from compensation.drift.thermal_model import ThermalModel
-from compensation.drift.training import frame_states
-from compensation.drift.type_prior import fit_like
-from experiments.steps import Role
-from foundation.errors import SessionError
+from thermostand.compensation.drift.evaluation import rms_px
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.type_prior import fit_like
+from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 
 from .drawn_cameras import drawn_unit
 from .drawn_nights import Night, cycle, night, reference, warm_up

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.drift.bumps import find_bumps
-from compensation.drift.choosing import fit
-from compensation.drift.evaluation import evaluate
-from compensation.drift.unrepeated import Cause, Unrepeated, find_unrepeated
-from compensation.reporting.report import write_report
+from thermostand.compensation.drift.bumps import find_bumps
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.evaluation import evaluate
+from thermostand.compensation.drift.unrepeated import Cause, Unrepeated, find_unrepeated
+from thermostand.compensation.reporting.report import write_report
 
 from .drawn_cameras import drawn_camera
 from .drawn_nights import followed_cycle, full_night, night, reference, warm_up

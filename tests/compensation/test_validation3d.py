@@ -10,23 +10,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from compensation.calibration.adjustment import adjust
-from compensation.calibration.averages import mean_centres
-from compensation.calibration.calibrate import Model, calibrate
-from compensation.calibration.camera_file import CameraFile, camera_file
-from compensation.calibration.stage_geometry import TableSigma
-from compensation.drift.drift_model import Outside
-from compensation.drift.paper_fit import fit_paper
-from compensation.drift.paper_model import PaperModel
-from compensation.observations import Float
-from compensation.reporting.validation_report import validation_page
-from compensation.validation3d.deviations import Camera, Deviations, deviations
-from compensation.validation3d.document import as_json
-from compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from compensation.validation3d.poses import Doubts, find
-from compensation.validation3d.validate import LensModel, Validation, camera_of, check_same, validate
-from compensation.validation3d.validation_text import summary
-from foundation.errors import CalibrationError, SessionError
+from thermostand.compensation.calibration.adjustment import adjust
+from thermostand.compensation.calibration.averages import mean_centres
+from thermostand.compensation.calibration.calibrate import Model, calibrate
+from thermostand.compensation.calibration.camera_file import CameraFile, camera_file
+from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.compensation.drift.drift_model import Outside
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.observations import Float
+from thermostand.compensation.reporting.validation_report import validation_page
+from thermostand.compensation.validation3d.deviations import Camera, Deviations, deviations
+from thermostand.compensation.validation3d.document import as_json
+from thermostand.compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
+from thermostand.compensation.validation3d.poses import Doubts, find
+from thermostand.compensation.validation3d.validate import LensModel, Validation, camera_of, check_same, validate
+from thermostand.compensation.validation3d.validation_text import summary
+from thermostand.foundation.errors import CalibrationError, SessionError
 
 from .calibration_cases import board, positions, target_of
 from .calibration_truth import SIZE, Laboratory, Truth, draw

@@ -15,26 +15,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from compensation import cli
-from compensation.budget.geometry import load_geometry
-from compensation.calibration.calibrate import Model, calibrate
-from compensation.calibration.camera_file import camera_file
-from compensation.calibration.session_centres import Positions
-from compensation.calibration.stage_geometry import TableSigma
-from compensation.drift.model_file import save_model
-from compensation.drift.paper_fit import fit_paper
-from compensation.observations import Float, Observations, observe_session, session_target
-from compensation.validation3d.validation_frames import validation_frames
-from experiments.steps import Role
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.documents import parse_document
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Batch, Item, StepMark, StepState
-from foundation.readings import Frame, Quality, Reading
-from markers.target import Target
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.compensation import cli
+from thermostand.compensation.budget.geometry import load_geometry
+from thermostand.compensation.calibration.calibrate import Model, calibrate
+from thermostand.compensation.calibration.camera_file import camera_file
+from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.compensation.drift.model_file import save_model
+from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.observations import Float, Observations, observe_session, session_target
+from thermostand.compensation.validation3d.validation_frames import validation_frames
+from thermostand.experiments.steps import Role
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Item, StepMark, StepState
+from thermostand.foundation.readings import Frame, Quality, Reading
+from thermostand.markers.target import Target
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
 from .synthetic import observations as thermal_cycle

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from compensation.apply.compensate_images import warp
-from compensation.drift_runtime import LATTICE_PX, source_offset
-from markers.detection import detect
-from markers.target import load_target
-from stand.config.stand_config import packaged
 from tests.compensation.rendered import Scene, render
 from tests.nightly import by_night
+from thermostand.compensation.apply.compensate_images import warp
+from thermostand.compensation.drift_runtime import LATTICE_PX, source_offset
+from thermostand.markers.detection import detect
+from thermostand.markers.target import load_target
+from thermostand.stand.config.stand_config import packaged
 
 SMALL = (200, 160)
 

@@ -9,10 +9,10 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from markers.detection import DetectionError, Flag, detect
-from markers.image_file import read_image
-from markers.target import DonutMarkers, OddMarker, Target
 from tests.nightly import by_night
+from thermostand.markers.detection import DetectionError, Flag, detect
+from thermostand.markers.image_file import read_image
+from thermostand.markers.target import DonutMarkers, OddMarker, Target
 
 from .rendered import Scene, photograph, render, true_centres_px
 from .test_markers import HALF, PAPER, rms_mpx

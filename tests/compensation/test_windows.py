@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.readings import Frame
-from markers.detection import Flag, detect
-from markers.target import load_target
-from markers.windows import MARGIN_px, marker_windows
-from recording.format.images import decode_image
-from recording.format.roi import RoiEncoder
 from tests.nightly import by_night
+from thermostand.foundation.readings import Frame
+from thermostand.markers.detection import Flag, detect
+from thermostand.markers.target import load_target
+from thermostand.markers.windows import MARGIN_px, marker_windows
+from thermostand.recording.format.images import decode_image
+from thermostand.recording.format.roi import RoiEncoder
 
 from .rendered import Scene, photograph, project, render
 

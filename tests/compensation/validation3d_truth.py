@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.observations import Observations
-from compensation.validation3d.validation_frames import ValidationFrames
+from thermostand.compensation.observations import Observations
+from thermostand.compensation.validation3d.validation_frames import ValidationFrames
 
 from .calibration_truth import SIZE, VALIDATION, Laboratory, Truth, ellipse_centres
 from .synthetic import CAMERA_ABOVE_CHAMBER_K, REFERENCE_DEGC, TARGET, facts

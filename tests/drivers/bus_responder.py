@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from pymodbus.framer.rtu import FramerRTU
 
-from drivers.wires.bus import Bus
+from thermostand.drivers.wires.bus import Bus
 
 TIMEOUT_S = 0.05
 LATE_S = 0.08  # after the time-out, before the quarantine (0.1 s) ends

@@ -5,12 +5,12 @@ from __future__ import annotations
 import struct
 from contextlib import suppress
 
-from drivers.sim.gige import gvcp, gvsp
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.genicam import features
-from drivers.sim.gige.gvcp_device import ControlChannel
 from tests.drivers.canned_line import Feed, Parser
 from tests.sim.gvcp_client import decode_ack, decode_leader
+from thermostand.drivers.sim.gige import gvcp, gvsp
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.gvcp_device import ControlChannel
 
 _MEMORY, _MEMORY_SIZE = 0x10000, 0x400  # of the features
 _PEER = ("127.0.0.1", 40001)

@@ -7,13 +7,19 @@ from contextlib import suppress
 from math import isnan
 from typing import Any, Literal
 
-from drivers.devices.chambers import chamber_ascii2, chamber_cts, chamber_espec, chamber_julabo, chamber_simserv
-from drivers.devices.chambers.chamber_settings import Ascii2Settings, CtsSettings, EspecSettings
-from drivers.devices.probes import Probe, ProbeSettings
-from drivers.wires.line_client import LineClient
-from foundation.clock import WallClock
-from foundation.errors import GarbledReply, Refused, Unreachable
 from tests.drivers.canned_line import Feed, Line, Parser
+from thermostand.drivers.devices.chambers import (
+    chamber_ascii2,
+    chamber_cts,
+    chamber_espec,
+    chamber_julabo,
+    chamber_simserv,
+)
+from thermostand.drivers.devices.chambers.chamber_settings import Ascii2Settings, CtsSettings, EspecSettings
+from thermostand.drivers.devices.probes import Probe, ProbeSettings
+from thermostand.drivers.wires.line_client import LineClient
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import GarbledReply, Refused, Unreachable
 
 _ASCII2 = (
     b"0050.0 0024.6 0080.0 0066.7 0090.0 0090.0 0000.0 0023.8 0000.0 0022.2 0000.0 0025.5 0000.0 0024.4 "

@@ -7,13 +7,13 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
-from drivers.devices.motion.flap import Flap, FlapSettings
-from drivers.wires.modbus_client import BusSettings, ModbusClient, SerialClient, TcpClient, WireFault
-from drivers.wires.ximc_client import XimcClient
-from foundation.clock import VirtualClock
-from foundation.errors import DeviceError, GarbledReply
-from foundation.readings import Quality
 from tests.drivers.canned_line import Feed, Line, Parser
+from thermostand.drivers.devices.motion.flap import Flap, FlapSettings
+from thermostand.drivers.wires.modbus_client import BusSettings, ModbusClient, SerialClient, TcpClient, WireFault
+from thermostand.drivers.wires.ximc_client import XimcClient
+from thermostand.foundation.clock import VirtualClock
+from thermostand.foundation.errors import DeviceError, GarbledReply
+from thermostand.foundation.readings import Quality
 
 # ------------------------------------------------------------------------------------------------------------- Modbus
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
-from drivers.devices.imager.radiometry import temperatures_degC
-from drivers.sim.units.radiometric import Shot, counts_of, jpeg_of
 from tests.drivers.canned_line import Feed, Parser
+from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
+from thermostand.drivers.devices.imager.radiometry import temperatures_degC
+from thermostand.drivers.sim.units.radiometric import Shot, counts_of, jpeg_of
 
 _SCENE_DEGC = np.linspace(10.0, 50.0, 64).reshape(8, 8)
 _SPOTS = {"lens": (3, 4), "1": (5, 5)}

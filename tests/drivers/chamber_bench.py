@@ -11,17 +11,17 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
-from drivers.devices.chambers.climate_chamber import ClimateChamber
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
-from drivers.sim.units.julabo_circulator import FakeJulabo
-from drivers.sim.units.simserv_chamber import FakeSimserv
-from drivers.sim.wire import PtyWire, TcpWire
-from drivers.wires.line_client import LineClient
-from foundation.clock import Clock, FollowedClock, WallClock, seconds_ns
-from foundation.readings import Reading
+from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
+from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamber
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
+from thermostand.drivers.sim.units.julabo_circulator import FakeJulabo
+from thermostand.drivers.sim.units.simserv_chamber import FakeSimserv
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.wires.line_client import LineClient
+from thermostand.foundation.clock import Clock, FollowedClock, WallClock, seconds_ns
+from thermostand.foundation.readings import Reading
 
 LIMIT_S = 60.0  # of what comes at once; a test that fails is not to hang
 START_NS = 1_700_000_000_000_000_000

@@ -16,11 +16,11 @@ from pymodbus.pdu import ModbusPDU
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import SimDevice
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import PtyWire
-from drivers.wires.bus import Bus, BusSettings
-from foundation.clock import WallClock
 from tests.drivers.bus_responder import TIMEOUT_S, Responder
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import PtyWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.foundation.clock import WallClock
 
 Serve = Callable[[list[SimDevice], list[type[ModbusPDU]]], Awaitable[str]]
 

@@ -13,8 +13,16 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.sim.units.modbus import ILLEGAL_ADDRESS, Refusal, Timeline, answer, reads_words, writes_one, writes_words
-from foundation.clock import NS_PER_S, Now
+from thermostand.drivers.sim.units.modbus import (
+    ILLEGAL_ADDRESS,
+    Refusal,
+    Timeline,
+    answer,
+    reads_words,
+    writes_one,
+    writes_words,
+)
+from thermostand.foundation.clock import NS_PER_S, Now
 
 BAND_K = 5.0
 REMOTE_FALLS_BACK_s = 10.0  # how long a remote set point lives unless it is written again

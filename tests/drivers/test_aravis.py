@@ -2,9 +2,9 @@ import os
 
 import pytest
 
-from drivers.framing.aravis_library import DEVICE_ERRORS, AravisError, Functions, library, load
-from drivers.wires.aravis import GigeDevice
-from foundation.errors import StandError
+from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, AravisError, Functions, library, load
+from thermostand.drivers.wires.aravis import GigeDevice
+from thermostand.foundation.errors import StandError
 
 
 @pytest.fixture

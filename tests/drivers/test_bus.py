@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import PtyWire
-from drivers.wires.bus import Bus, BusSettings
-from foundation.clock import WallClock
-from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 from tests.drivers.bus_responder import TIMEOUT_S, Fault, Responder, flip, frame, late, read_is_right
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import PtyWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
 
@@ -124,7 +124,7 @@ async def test_a_failed_read_is_asked_again_only_if_that_can_help_and_the_next_i
 async def test_a_late_reply_is_not_credited_to_the_next_request(
     bus: Bus, responder: Responder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.wires.bus.READ_RETRIES", 0)
+    monkeypatch.setattr("thermostand.drivers.wires.bus.READ_RETRIES", 0)
     responder.fault = late
     with pytest.raises(Unreachable):
         await read_is_right(bus, 100)
@@ -180,7 +180,7 @@ async def test_a_soak_with_a_fault_in_every_sixth_reply_gives_no_wrong_value(
     bus: Bus, responder: Responder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "drivers.wires.bus.READ_RETRIES", 0
+        "thermostand.drivers.wires.bus.READ_RETRIES", 0
     )  # asking again would hide a shifted reply behind its own value
     seeded = random.Random(2018)
     right = failed = 0

@@ -9,15 +9,15 @@ import asyncio
 import numpy as np
 import pytest
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
-from drivers.wires.camera_errors import device_error
-from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
-from drivers.wires.frame_count import FrameCount
-from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import DeviceError, Refused, Unreachable
-from foundation.readings import Quality
 from tests.stock_camera import ADDRESS, SERIAL
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
+from thermostand.drivers.wires.camera_errors import device_error
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
+from thermostand.drivers.wires.frame_count import FrameCount
+from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.errors import DeviceError, Refused, Unreachable
+from thermostand.foundation.readings import Quality
 
 EXPOSURE_S = 0.01
 TEST_REGISTER = 0x1F0  # 0x12345678 in its XML

@@ -14,20 +14,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.framing.aravis_library import DEVICE_ERRORS, AravisError
-from drivers.sim.gige.camera import FakeCamera
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.genicam_file import GenicamFile, read_genicam
-from drivers.sim.gige.gvcp import Ack, Nack, Request, Status
-from drivers.sim.gige.gvcp_device import ControlChannel
-from drivers.wires import camera_connection
-from drivers.wires.aravis import GigeDevice
-from drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
-from drivers.wires.camera_temperature import NoTemperature, find_temperature
-from foundation.clock import WallClock
-from foundation.errors import ConfigError, Refused
-from foundation.readings import Quality
 from tests.addresses import usual_camera_address
 from tests.dialects import (
     DIALECTS,
@@ -46,6 +32,20 @@ from tests.dialects import (
     register,
 )
 from tests.system.conftest import require_aravis
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, AravisError
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.genicam_file import GenicamFile, read_genicam
+from thermostand.drivers.sim.gige.gvcp import Ack, Nack, Request, Status
+from thermostand.drivers.sim.gige.gvcp_device import ControlChannel
+from thermostand.drivers.wires import camera_connection
+from thermostand.drivers.wires.aravis import GigeDevice
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
+from thermostand.drivers.wires.camera_temperature import NoTemperature, find_temperature
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import ConfigError, Refused
+from thermostand.foundation.readings import Quality
 
 BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16, "Mono10Packed": 10, "Mono12Packed": 12}
 BITS |= {"Mono10p": 10, "Mono12p": 12}

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.wires.aravis import unpacked
-from drivers.wires.camera_settings import PixelFormat, frame_bytes
+from thermostand.drivers.wires.aravis import unpacked
+from thermostand.drivers.wires.camera_settings import PixelFormat, frame_bytes
 
 # 0x123 and 0xABC of 12 bits, 0x123 and 0x2BC of 10, as the standards draw them.
 LAYOUTS: list[tuple[PixelFormat, str, list[int]]] = [

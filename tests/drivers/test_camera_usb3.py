@@ -6,13 +6,13 @@ import ctypes
 import numpy as np
 import pytest
 
-from drivers.devices.cameras.camera_usb3 import Camera, Settings
-from drivers.framing.aravis_library import ARAVIS_SONAMES, load
-from drivers.wires.camera_settings import GigeCameraSettings
-from foundation.clock import WallClock
-from foundation.errors import Refused
-from foundation.readings import Quality
 from tests.system.conftest import require_aravis
+from thermostand.drivers.devices.cameras.camera_usb3 import Camera, Settings
+from thermostand.drivers.framing.aravis_library import ARAVIS_SONAMES, load
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import Refused
+from thermostand.foundation.readings import Quality
 
 FAKE = "Fake_1"
 

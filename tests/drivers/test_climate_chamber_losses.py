@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.chambers.chamber_ascii2 import number, parse
-from drivers.devices.chambers.chamber_cts import framed, unframed
-from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
-from foundation.readings import Quality
 from tests.drivers.chamber_bench import ALLOWED_DEGC, MAKES, ON_WIRES, WIRES, bench_of, running_at_30_degC
+from thermostand.drivers.devices.chambers.chamber_ascii2 import number, parse
+from thermostand.drivers.devices.chambers.chamber_cts import framed, unframed
+from thermostand.foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
+from thermostand.foundation.readings import Quality
 
 
 @pytest.mark.parametrize(("make", "wire"), ON_WIRES)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.chambers.chamber_simserv import reply_of
-from foundation.clock import VirtualClock, WallClock
-from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused
 from tests.drivers.chamber_bench import MAKES, ON_WIRES, bench_of, running_at_30_degC
+from thermostand.drivers.devices.chambers.chamber_simserv import reply_of
+from thermostand.foundation.clock import VirtualClock, WallClock
+from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused
 
 
 @pytest.mark.parametrize(("make", "wire"), ON_WIRES)
@@ -302,7 +302,7 @@ async def test_the_pause_between_two_requests_costs_no_real_time_in_virtual_time
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     paused: list[float] = []
-    monkeypatch.setattr("drivers.wires.line_client.time.sleep", paused.append)
+    monkeypatch.setattr("thermostand.drivers.wires.line_client.time.sleep", paused.append)
     for clock, is_paused in ((WallClock(), True), (VirtualClock(0), False)):
         async with bench_of("espec", "tcp", tmp_path, clock, gap_s=5.0) as bench:
             await bench.driver.open()

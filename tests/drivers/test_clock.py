@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foundation.clock import (
+from tests.host import Host
+from thermostand.foundation.clock import (
     NS_PER_S,
     FollowedClock,
     VirtualClock,
@@ -15,8 +16,7 @@ from foundation.clock import (
     boot_time_ns,
     seconds_ns,
 )
-from foundation.errors import Unreachable
-from tests.host import Host
+from thermostand.foundation.errors import Unreachable
 
 
 async def driven(clock: VirtualClock, *work: object) -> None:
@@ -225,7 +225,7 @@ async def test_a_sleeper_is_late_by_no_more_than_a_second_after_a_suspend(monkey
 
     clock = host.clock()
     due_ns = clock.now_ns() + seconds_ns(30)
-    monkeypatch.setattr("foundation.clock.asyncio.sleep", pass_awake)
+    monkeypatch.setattr("thermostand.foundation.clock.asyncio.sleep", pass_awake)
     await clock.sleep_until(due_ns)
     assert pieces_s == [0, 1, 1]
     assert clock.now_ns() == due_ns + seconds_ns(12)
@@ -238,7 +238,7 @@ def test_a_thread_that_waits_is_late_by_no_more_than_a_second_after_a_suspend(mo
         pieces_s.append(piece_s)
         host.suspended_ns += seconds_ns(40)
 
-    monkeypatch.setattr("foundation.clock.time.sleep", pass_awake)
+    monkeypatch.setattr("thermostand.foundation.clock.time.sleep", pass_awake)
     clock = host.clock()
     block_until(clock, clock.now_ns() + seconds_ns(30))
     assert pieces_s == [1]

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.genicam import features
-from drivers.sim.gige.gvcp import Command, Request
-from drivers.sim.gige.gvcp_device import ControlChannel
-from drivers.wires.discovery import GVCP_PORT, FoundCamera, cameras_at, decode_answer, usb_devices
-from stand.commands.command_table import app
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.gvcp import Command, Request
+from thermostand.drivers.sim.gige.gvcp_device import ControlChannel
+from thermostand.drivers.wires.discovery import GVCP_PORT, FoundCamera, cameras_at, decode_answer, usb_devices
+from thermostand.stand.commands.command_table import app
 
 HERE, SILENT = "127.0.0.91", "127.0.0.92"
 

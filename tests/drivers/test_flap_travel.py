@@ -2,8 +2,8 @@
 
 import pytest
 
-from drivers.devices.motion.flap_travel import Travel
-from foundation.clock import NS_PER_S, seconds_ns
+from thermostand.drivers.devices.motion.flap_travel import Travel
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
 
 Look = tuple[float, int, bool]  # s since the target was sent, position, saturated
 

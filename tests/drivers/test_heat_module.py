@@ -9,21 +9,21 @@ from contextlib import asynccontextmanager, suppress
 import pytest
 from pydantic import ValidationError
 
-from drivers.devices.regulators.heat_module import HeatModule, HeatModuleSettings
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units import heat_module as fake_module
-from drivers.sim.units.heat_module import TRIPPED, FakeHeatModule
-from drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
-from drivers.sim.wire import TcpWire
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.modbus_unit import ModbusUnit
-from drivers.wires.registers import RegisterMap, load_register_map
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.documents import parse_document
-from foundation.errors import ConfigError, DeviceFault, Unreachable
-from foundation.readings import Quality
-from stand.config.stand_config import packaged
+from thermostand.drivers.devices.regulators.heat_module import HeatModule, HeatModuleSettings
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units import heat_module as fake_module
+from thermostand.drivers.sim.units.heat_module import TRIPPED, FakeHeatModule
+from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
+from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.modbus_unit import ModbusUnit
+from thermostand.drivers.wires.registers import RegisterMap, load_register_map
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError, DeviceFault, Unreachable
+from thermostand.foundation.readings import Quality
+from thermostand.stand.config.stand_config import packaged
 
 START_NS = 1_700_000_000_000_000_000
 UNIT = 4

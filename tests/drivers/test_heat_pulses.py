@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings, pulse_s
-from foundation.clock import FollowedClock, seconds_ns
-from foundation.errors import DeviceFault, Refused
-from foundation.readings import Reading
+from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings, pulse_s
+from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.errors import DeviceFault, Refused
+from thermostand.foundation.readings import Reading
 
 SETTINGS = PulsesSettings(cycle_s=20, min_on_s=1, min_off_s=2)
 

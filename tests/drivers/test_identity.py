@@ -8,21 +8,21 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivers.devices.inputs import Inputs
-from drivers.devices.relays import Relays
-from drivers.devices.thermometers import Thermometers, ThermometerSettings
-from drivers.settings import Identity, same_device
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.modbus import TcpEngine
-from drivers.sim.units.relays import FakeRelays
-from drivers.sim.units.thermometers import FakeThermometers
-from drivers.sim.wire import TcpWire
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import RegisterMap, load_register_map
-from foundation.clock import FollowedClock, WallClock
-from foundation.documents import parse_document
-from foundation.errors import DeviceFault, Unreachable
+from thermostand.drivers.devices.inputs import Inputs
+from thermostand.drivers.devices.relays import Relays
+from thermostand.drivers.devices.thermometers import Thermometers, ThermometerSettings
+from thermostand.drivers.settings import Identity, same_device
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.modbus import TcpEngine
+from thermostand.drivers.sim.units.relays import FakeRelays
+from thermostand.drivers.sim.units.thermometers import FakeThermometers
+from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.registers import RegisterMap, load_register_map
+from thermostand.foundation.clock import FollowedClock, WallClock
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import DeviceFault, Unreachable
 
 MAPS = Path(__file__).parents[2] / "configs" / "registers"
 START_NS = 1_700_000_000_000_000_000

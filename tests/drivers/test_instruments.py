@@ -8,19 +8,19 @@ from typing import Literal
 
 import pytest
 
-from drivers.devices.probes import Probe, ProbeSettings
-from drivers.devices.thermometers import Calibration, Thermometers, ThermometerSettings
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.adam_4015 import FakeAdam4015
-from drivers.sim.units.modbus import TcpEngine
-from drivers.sim.units.probes import FakeProbe
-from drivers.sim.wire import PtyWire, TcpWire
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import load_register_map
-from foundation.clock import FollowedClock, WallClock
-from foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
-from foundation.readings import Quality, Reading
+from thermostand.drivers.devices.probes import Probe, ProbeSettings
+from thermostand.drivers.devices.thermometers import Calibration, Thermometers, ThermometerSettings
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.adam_4015 import FakeAdam4015
+from thermostand.drivers.sim.units.modbus import TcpEngine
+from thermostand.drivers.sim.units.probes import FakeProbe
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.registers import load_register_map
+from thermostand.foundation.clock import FollowedClock, WallClock
+from thermostand.foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
+from thermostand.foundation.readings import Quality, Reading
 
 MAPS = Path(__file__).parents[2] / "configs" / "registers"
 START_NS = 1_700_000_000_000_000_000

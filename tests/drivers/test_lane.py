@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
-from foundation.calls import Lane, Line, answer_all
-from foundation.clock import Clock, VirtualClock, WallClock
+from thermostand.foundation.calls import Lane, Line, answer_all
+from thermostand.foundation.clock import Clock, VirtualClock, WallClock
 
 
 @pytest.fixture(params=[WallClock(), VirtualClock(0)], ids=["real", "virtual"])
@@ -84,8 +84,8 @@ async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goe
 
 HANGS = """
 import asyncio, threading
-from foundation.clock import WallClock
-from foundation.calls import Lane, Line, answer_all
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.calls import Lane, Line, answer_all
 
 async def main():
     asyncio.create_task(Lane("hangs", WallClock(), patient=False).call(threading.Event().wait))
@@ -102,7 +102,7 @@ def test_a_call_that_never_ends_does_not_keep_the_process_from_its_end():
 async def test_a_thread_that_memory_does_not_suffice_for_fails_its_calls_and_the_loop_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    monkeypatch.setattr("foundation.calls._BEGIN_LIMIT_S", 0.01)
+    monkeypatch.setattr("thermostand.foundation.calls._BEGIN_LIMIT_S", 0.01)
     monkeypatch.setattr("_thread.start_new_thread", lambda function, args: 0)  # it ends before its first step
     died = Lane("disk", WallClock())
     with pytest.raises(MemoryError, match="no memory for the thread of disk"):
@@ -123,7 +123,7 @@ class Moved:
     """Of a module that another version of the program has no more."""
 
     def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
-        return importlib.import_module, ("foundation.not_there",)
+        return importlib.import_module, ("thermostand.foundation.not_there",)
 
 
 def moved(_: object) -> Moved:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import PtyWire, TcpWire
-from drivers.wires.link import ByteLink, SerialSettings, open_link
-from foundation.errors import Unreachable
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.wires.link import ByteLink, SerialSettings, open_link
+from thermostand.foundation.errors import Unreachable
 
 LINE = SerialSettings(baud=115200, stopbits=2)
 
@@ -121,7 +121,7 @@ def test_a_tcp_peer_that_hangs_up_is_reported_as_such() -> None:
 
 
 def test_a_serial_peer_that_takes_no_bytes_does_not_hold_the_writer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.wires.link._WRITE_S", 0.1)
+    monkeypatch.setattr("thermostand.drivers.wires.link._WRITE_S", 0.1)
     master, slave = os.openpty()
     link = open_link("stage", f"serial:{os.ttyname(slave)}", LINE)
     with closing(link), bounded(), pytest.raises(Unreachable, match="is gone"):
@@ -131,7 +131,7 @@ def test_a_serial_peer_that_takes_no_bytes_does_not_hold_the_writer(monkeypatch:
 
 
 def test_a_tcp_peer_that_takes_no_bytes_does_not_hold_the_writer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.wires.link._WRITE_S", 0.1)
+    monkeypatch.setattr("thermostand.drivers.wires.link._WRITE_S", 0.1)
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         closing(linked(server)) as link,

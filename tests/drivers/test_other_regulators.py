@@ -9,19 +9,19 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivers.devices.regulators.regulator import Regulator
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.modbus import TcpEngine
-from drivers.sim.wire import TcpWire
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import RegisterMap, load_register_map
-from foundation.clock import FollowedClock, WallClock, seconds_ns
-from foundation.documents import parse_document
-from foundation.errors import ConfigError, DeviceFault, Refused, Unreachable
-from foundation.readings import Quality, Reading
-from stand.config.stand_config import packaged
 from tests.drivers.other_regulators import DEGC, FakeBinder, FakeEurotherm, FakeEzZone, FakeF4t, float_words
+from thermostand.drivers.devices.regulators.regulator import Regulator
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.modbus import TcpEngine
+from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.registers import RegisterMap, load_register_map
+from thermostand.foundation.clock import FollowedClock, WallClock, seconds_ns
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError, DeviceFault, Refused, Unreachable
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.stand.config.stand_config import packaged
 
 START_NS = 1_700_000_000_000_000_000
 Fake = FakeEurotherm | FakeEzZone | FakeF4t | FakeBinder

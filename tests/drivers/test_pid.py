@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.devices.regulators import pid
-from drivers.devices.regulators.pid import Law
+from thermostand.drivers.devices.regulators import pid
+from thermostand.drivers.devices.regulators.pid import Law
 
 PLAIN = Law(
     gain_percent_per_K=10,

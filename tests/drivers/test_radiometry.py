@@ -11,9 +11,9 @@ import flyr
 import numpy as np
 import pytest
 
-from drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
-from drivers.devices.imager.radiometry import Air, temperatures_degC
-from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
+from thermostand.drivers.devices.imager.radiometry import Air, temperatures_degC
+from thermostand.drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 
 SCENE_DEGC = np.linspace(-15.0, 75.0, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
 SPOTS = {"lens": (80, 60), "housing": (40, 30), "back": (120, 90)}

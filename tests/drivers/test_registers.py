@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.wires.modbus_unit import Block, Sample, decode, decode_blocks, encode, plan_blocks
-from drivers.wires.registers import Point, RegisterMap, load_register_map
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
+from thermostand.drivers.wires.modbus_unit import Block, Sample, decode, decode_blocks, encode, plan_blocks
+from thermostand.drivers.wires.registers import Point, RegisterMap, load_register_map
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
 
 MAPS = Path(__file__).parents[2] / "configs" / "registers"
 

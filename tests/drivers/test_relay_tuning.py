@@ -4,10 +4,10 @@ import math
 
 import pytest
 
-from drivers.devices.regulators import relay_tuning
-from drivers.devices.regulators.pid import Law
-from drivers.devices.regulators.relay_tuning import Tuning, TuningSettings
-from foundation.clock import seconds_ns
+from thermostand.drivers.devices.regulators import relay_tuning
+from thermostand.drivers.devices.regulators.pid import Law
+from thermostand.drivers.devices.regulators.relay_tuning import Tuning, TuningSettings
+from thermostand.foundation.clock import seconds_ns
 
 SETTINGS, LAW = TuningSettings(), Law()
 SP_degC = 45.0

@@ -12,11 +12,11 @@ from pymodbus.datastore import ModbusServerContext
 from pymodbus.pdu import ModbusPDU
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.devices.relays import Relays
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import load_register_map
-from foundation.clock import WallClock
-from foundation.errors import ConfigError, DeviceFault, GarbledReply, Refused, Unreachable
+from thermostand.drivers.devices.relays import Relays
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.registers import load_register_map
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import ConfigError, DeviceFault, GarbledReply, Refused, Unreachable
 
 Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
 

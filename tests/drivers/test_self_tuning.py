@@ -7,17 +7,17 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from drivers.devices.regulators.regulator import Regulator
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.modbus import TcpEngine
-from drivers.sim.units.regulator import FakeRegulator
-from drivers.sim.wire import TcpWire
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import load_register_map
-from foundation.clock import FollowedClock, WallClock, seconds_ns
-from foundation.errors import DeviceFault, Occupied
-from stand.config.stand_config import packaged
+from thermostand.drivers.devices.regulators.regulator import Regulator
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.modbus import TcpEngine
+from thermostand.drivers.sim.units.regulator import FakeRegulator
+from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.registers import load_register_map
+from thermostand.foundation.clock import FollowedClock, WallClock, seconds_ns
+from thermostand.foundation.errors import DeviceFault, Occupied
+from thermostand.stand.config.stand_config import packaged
 
 START_NS = 1_700_000_000_000_000_000
 CONSTANTS = (0x2A00, 0x2A01, 0x2A02)  # proportional band, integral and derivative time of the heat

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.imager.thermal_imager import SpotSettings, ThermalImager, ThermalImagerSettings
-from drivers.sim.units.thermal_imager import FakeThermalImager
-from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
-from foundation.items import Event, Item, Original
-from foundation.readings import Quality, Reading
+from thermostand.drivers.devices.imager.thermal_imager import SpotSettings, ThermalImager, ThermalImagerSettings
+from thermostand.drivers.sim.units.thermal_imager import FakeThermalImager
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.items import Event, Item, Original
+from thermostand.foundation.readings import Quality, Reading
 
 START_NS = 1_800_000_000 * NS_PER_S
 SPOTS = {"lens": (80, 60), "housing": (40, 30), "back": (120, 90)}

@@ -10,12 +10,12 @@ import pytest
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from drivers.devices.thermometers import Thermometers, ThermometerSettings
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import load_register_map
-from foundation.clock import WallClock
-from foundation.errors import ConfigError, DeviceFault, Unreachable
-from foundation.readings import Quality, Reading
+from thermostand.drivers.devices.thermometers import Thermometers, ThermometerSettings
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.registers import load_register_map
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import ConfigError, DeviceFault, Unreachable
+from thermostand.foundation.readings import Quality, Reading
 
 Serve = Callable[..., Awaitable[str]]  # the fixture serve_modbus
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.framing.ximc import ERROR_SIZES, Damage, Frame, crc16, decode, encode, frame_size
+from thermostand.drivers.framing.ximc import ERROR_SIZES, Damage, Frame, crc16, decode, encode, frame_size
 
 # letters, payload, bytes on the wire; the longer ones as libximc 3.1.1 sent them: it fills reserved bytes with 0xCC.
 CASES = [

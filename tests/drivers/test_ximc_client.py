@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.framing.ximc import encode
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import PtyWire, TcpWire
-from drivers.wires.link import ByteLink, SerialSettings, open_link
-from drivers.wires.ximc_client import XimcClient
-from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
+from thermostand.drivers.framing.ximc import encode
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.wires.link import ByteLink, SerialSettings, open_link
+from thermostand.drivers.wires.ximc_client import XimcClient
+from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 LINE = SerialSettings(baud=115200, stopbits=2)
 POSITION = struct.Struct("<ihq6x")

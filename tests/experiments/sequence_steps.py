@@ -2,7 +2,7 @@
 
 from hypothesis import strategies as st
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     Capture,
     CheckHome,
     CloseFlap,

@@ -10,22 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from experiments.calibration import Calibration, calibration
-from experiments.steps import (
-    Capture,
-    CheckHome,
-    PowerCamera,
-    Prompt,
-    Role,
-    SetTemperature,
-    Soak,
-    StopChamber,
-)
-from experiments.validation import Validation, validation
-from experiments.warm_up import WarmUp, warm_up
-from foundation.documents import load_document
-from foundation.errors import ConfigError
-from stand.config.recipe import Recipe
 from tests.experiments.sequence_steps import (
     GRID,
     PLACES,
@@ -38,6 +22,22 @@ from tests.experiments.sequence_steps import (
     places,
     table_positions,
 )
+from thermostand.experiments.calibration import Calibration, calibration
+from thermostand.experiments.steps import (
+    Capture,
+    CheckHome,
+    PowerCamera,
+    Prompt,
+    Role,
+    SetTemperature,
+    Soak,
+    StopChamber,
+)
+from thermostand.experiments.validation import Validation, validation
+from thermostand.experiments.warm_up import WarmUp, warm_up
+from thermostand.foundation.documents import load_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.recipe import Recipe
 
 # Whatever the parameters are
 

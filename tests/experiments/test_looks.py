@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from experiments.looks import Looks, looks_of
-from experiments.steps import Capture, Role, number_steps
+from thermostand.experiments.looks import Looks, looks_of
+from thermostand.experiments.steps import Capture, Role, number_steps
 
 
 def captures(*set_points_degC: float, role: Role = Role.FIT) -> Looks | None:

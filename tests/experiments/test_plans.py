@@ -3,7 +3,7 @@ import itertools
 import pytest
 from pydantic import ValidationError
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     Capture,
     CloseFlap,
     KnownStand,
@@ -19,10 +19,10 @@ from experiments.steps import (
     number_steps,
     usual_s,
 )
-from experiments.thermal_cycle import ThermalCycle, thermal_cycle
-from experiments.validation import Validation, validation
-from experiments.warm_up import WarmUp, warm_up
-from stand.config.recipe import Recipe
+from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from thermostand.experiments.validation import Validation, validation
+from thermostand.experiments.warm_up import WarmUp, warm_up
+from thermostand.stand.config.recipe import Recipe
 
 CYCLE = ThermalCycle(set_points_degC=(34.0, 44.0, 24.0), held_out_degC=(34.0,), cycles=2)
 

@@ -6,8 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from experiments.calibration import Calibration, calibration
-from experiments.steps import (
+from tests.experiments.sequence_steps import (
+    GRID,
+    PLACES,
+    captures,
+    check_ids,
+    check_order,
+    table_positions,
+)
+from thermostand.experiments.calibration import Calibration, calibration
+from thermostand.experiments.steps import (
     Capture,
     CheckHome,
     CloseFlap,
@@ -24,20 +32,12 @@ from experiments.steps import (
     StopChamber,
     usual_s,
 )
-from experiments.validation import Validation, validation
-from experiments.warm_up import WarmUp, warm_up
-from foundation.documents import load_document
-from stand.config.recipe import Experiment, Recipe
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.estimate import price
-from tests.experiments.sequence_steps import (
-    GRID,
-    PLACES,
-    captures,
-    check_ids,
-    check_order,
-    table_positions,
-)
+from thermostand.experiments.validation import Validation, validation
+from thermostand.experiments.warm_up import WarmUp, warm_up
+from thermostand.foundation.documents import load_document
+from thermostand.stand.config.recipe import Experiment, Recipe
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.estimating.estimate import price
 
 RECIPES = [
     "calibration",

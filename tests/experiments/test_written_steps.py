@@ -8,7 +8,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     Capture,
     CheckHome,
     CloseFlap,
@@ -25,11 +25,11 @@ from experiments.steps import (
     Step,
     StopChamber,
 )
-from experiments.written import StepEntry
-from foundation.documents import load_document, parse_document
-from foundation.errors import ConfigError
-from stand.config.recipe import Recipe
-from stand.config.stand_config import packaged
+from thermostand.experiments.written import StepEntry
+from thermostand.foundation.documents import load_document, parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import packaged
 
 
 def planned(text: str) -> list[Step]:

@@ -21,14 +21,14 @@ import numpy as np
 from typer.main import get_command
 
 import thermostand
-from compensation.cli import app as compensate
-from stand.commands.command_table import app as stand
-from stand.config.stand_config import packaged
-from stand.serving.api.doors import Interface
-from stand.serving.page_room import PageRoom
-from stand.serving.viewing import Viewing
 from tests.stand.a_desk import ADesk, served
 from tests.stand.page_desk import TARGET, free_port
+from thermostand.compensation.cli import app as compensate
+from thermostand.stand.commands.command_table import app as stand
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.page_room import PageRoom
+from thermostand.stand.serving.viewing import Viewing
 
 APPS = {"stand": stand, "compensate": compensate}
 _KEPT = 48

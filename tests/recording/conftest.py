@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from recording.format.layout import FRAMES, TELEMETRY
 from tests.recording.damage import (
     fresh,
     write_segment,
 )
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
 
 
 @pytest.fixture(scope="module")

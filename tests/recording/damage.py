@@ -9,16 +9,16 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
-from foundation.clock import NS_PER_S
-from foundation.items import Batch, Event
-from foundation.readings import Frame, Reading
-from recording.format import messages
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FORMAT, FRAMES, TELEMETRY
-from recording.format.records import frame_places, read_frame, telemetry_messages
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
-from recording.writing.telemetry import BatchEncoder
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.format import messages
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
+from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "Zoë"}

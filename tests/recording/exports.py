@@ -4,10 +4,10 @@ import csv
 
 import pyarrow.parquet
 
-from recording.exporting.export import export
-from recording.format.images import ImageEncoding
-from recording.reading.session import Session
 from tests.recording.recorded import half_second, record
+from thermostand.recording.exporting.export import export
+from thermostand.recording.format.images import ImageEncoding
+from thermostand.recording.reading.session import Session
 
 
 def silent(done, text):

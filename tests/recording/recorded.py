@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.hub import Hub
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Quality, Reading, bad_reading
-from recording.format.images import ImageEncoding
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.records import frame_places, read_frame, telemetry_messages
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
+from thermostand.recording.format.images import ImageEncoding
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S + 123_456_789
 MS = 1_000_000

@@ -9,12 +9,12 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.hub import Hub
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading, bad_reading
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import limit_files
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading, bad_reading
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "virtual")

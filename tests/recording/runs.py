@@ -2,9 +2,9 @@
 
 import json
 
-from foundation.clock import NS_PER_S
-from foundation.items import Event, StepMark, StepState
-from recording.reading.journal_lines import JOURNAL_NAME, journal_lines, mark_of
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME, journal_lines, mark_of
 
 from .recorded import START_NS, half_second, record
 

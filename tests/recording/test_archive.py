@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from recording.exporting import archive as module
-from recording.exporting.archive import MANIFEST, Rule, archive, check_copy, delete, unfit
-from recording.reading.catalogue import look_at
-from recording.reading.notes import add_note, add_tags, read_notes
-from recording.repair.verify import verify
 from tests.recording.runs import record_run
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.exporting import archive as module
+from thermostand.recording.exporting.archive import MANIFEST, Rule, archive, check_copy, delete, unfit
+from thermostand.recording.reading.catalogue import look_at
+from thermostand.recording.reading.notes import add_note, add_tags, read_notes
+from thermostand.recording.repair.verify import verify
 
 DAY_NS = 86_400 * 10**9
 

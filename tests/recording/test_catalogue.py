@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from recording.reading import catalogue as module
-from recording.reading.catalogue import INDEX_NAME, Memory, catalogue, look_at
-from recording.reading.notes import add_note, add_tags
 from tests.recording.recorded import START_NS
 from tests.recording.runs import record_run
+from thermostand.recording.reading import catalogue as module
+from thermostand.recording.reading.catalogue import INDEX_NAME, Memory, catalogue, look_at
+from thermostand.recording.reading.notes import add_note, add_tags
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from foundation.clock import NS_PER_S, VirtualClock, WallClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Batch, Event
-from foundation.readings import Frame, Reading
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import ext4, limit_files, run, tmpfs
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")

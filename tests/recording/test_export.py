@@ -10,21 +10,21 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.instants import utc_text
-from foundation.items import Batch, Event
-from foundation.readings import Reading, bad_reading
-from recording.exporting.export import export
-from recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
-from recording.format.images import CAMERA_IMAGE
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.notes import add_note, add_tags
-from recording.reading.session import Session
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
 from tests.recording.exports import csv_rows, exported, parquet_rows, silent
 from tests.recording.recorded import ATTACHMENTS, INFO, MS, START_NS, frame, half_second, record
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.instants import utc_text
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.recording.exporting.export import export
+from thermostand.recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
+from thermostand.recording.format.images import CAMERA_IMAGE
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.notes import add_note, add_tags
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
 
 # channel of the session -> table and column of the export
 CHANNELS = {
@@ -328,12 +328,12 @@ PARQUET_WITHOUT_PYARROW = """
 import sys
 sys.modules["pyarrow"] = None  # as an interpreter that has none
 from pathlib import Path
-from recording.exporting.export import export
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
-from recording.reading.notes import add_note, add_tags
-from recording.reading.session import Session
-from recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
+from thermostand.recording.exporting.export import export
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
+from thermostand.recording.reading.notes import add_note, add_tags
+from thermostand.recording.reading.session import Session
+from thermostand.recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
 export(Session.open(Path(sys.argv[1])), Path(sys.argv[2]), telemetry="parquet", report=print)
 """
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from foundation.items import Batch, StepMark
-from foundation.readings import Reading
 from tests.recording.exports import csv_rows, exported, parquet_rows
 from tests.recording.recorded import half_second
+from thermostand.foundation.items import Batch, StepMark
+from thermostand.foundation.readings import Reading
 
 
 @pytest.mark.parametrize(("table_format", "images"), [("csv", True), ("parquet", True), ("csv", False)])

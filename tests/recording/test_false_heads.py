@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.mcap_bytes import CHUNK, LENGTH, RECORD, Source
-from recording.format.range_crc import RangeCrcs
-from recording.repair.salvage import salvage_session
 from tests.recording.damage import read_segment, write_segment
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.mcap_bytes import CHUNK, LENGTH, RECORD, Source
+from thermostand.recording.format.range_crc import RangeCrcs
+from thermostand.recording.repair.salvage import salvage_session
 
 ZSTD_HEAD = zstandard.ZstdCompressor().compress(bytes(1 << 20))[:9]
 CHUNK_OPCODE, ATTACHMENT_OPCODE, METADATA_OPCODE = 6, 9, 12
@@ -67,7 +67,7 @@ def false_heads(kind, size_bytes: int, step_bytes: int) -> bytes:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> type[Read]:
-    monkeypatch.setattr("recording.repair.salvage.Source", Read)
+    monkeypatch.setattr("thermostand.recording.repair.salvage.Source", Read)
     Read.read_bytes = 0
     return Read
 

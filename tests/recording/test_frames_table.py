@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.items import Batch, StepMark, StepState
-from foundation.readings import Reading
-from recording.format.restarts import restarted
-from recording.reading.interpolation import GAP_NS, interpolated
-from recording.reading.session import Session
+from thermostand.foundation.items import Batch, StepMark, StepState
+from thermostand.foundation.readings import Reading
+from thermostand.recording.format.restarts import restarted
+from thermostand.recording.reading.interpolation import GAP_NS, interpolated
+from thermostand.recording.reading.session import Session
 
 from .recorded import MS, START_NS, frame, record
 

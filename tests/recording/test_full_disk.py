@@ -8,15 +8,15 @@ import pytest
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.readings import Frame
-from recording.format.images import decode_image
-from recording.reading.gaps import reported_blocks
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import tmpfs
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.images import decode_image
+from thermostand.recording.reading.gaps import reported_blocks
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")

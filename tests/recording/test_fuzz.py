@@ -14,22 +14,22 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FORMAT, FRAMES, TELEMETRY
-from recording.format.records import frame_places, read_frame, telemetry_messages
-from recording.reading.overview import overview
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_session
-from recording.repair.verify import verify
-from recording.writing.forms import telemetry_topics
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
-from recording.writing.telemetry import TelemetryEncoder
 from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
+from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
+from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.repair.verify import verify
+from thermostand.recording.writing.forms import telemetry_topics
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.telemetry import TelemetryEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}

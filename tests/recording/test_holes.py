@@ -6,24 +6,24 @@ import time
 
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import StepState
-from recording.exporting.export import export
-from recording.exporting.replay import replay_and_record
-from recording.exporting.trim import trim
-from recording.format.holes import Hole, holes_in, holes_text
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.messages import TABLE_POSE
-from recording.format.summary import read_summary
-from recording.reading.glance import glance
-from recording.reading.overview import overview
-from recording.reading.run_word import Files, Run
-from recording.reading.session import Session
-from recording.reading.using import open_whole
-from recording.repair.salvage import salvage_session
-from recording.repair.verify import verify
 from tests.stand.hostile_sessions import everywhere
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import StepState
+from thermostand.recording.exporting.export import export
+from thermostand.recording.exporting.replay import replay_and_record
+from thermostand.recording.exporting.trim import trim
+from thermostand.recording.format.holes import Hole, holes_in, holes_text
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.messages import TABLE_POSE
+from thermostand.recording.format.summary import read_summary
+from thermostand.recording.reading.glance import glance
+from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.session import Session
+from thermostand.recording.reading.using import open_whole
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.repair.verify import verify
 
 from .damage import METADATA, write_segment
 from .recorded import START_NS, images, record, telemetry

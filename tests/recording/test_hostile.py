@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from foundation.documents import yaml_data
-from foundation.errors import ConfigError
-from recording.exporting.tables import Column, CsvTable
-from recording.repair.salvage import salvage_unfinished
-from stand.commands.sessions.session_commands import app
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.learned import learn
 from tests.recording.recorded import record
 from tests.recording.runs import SECONDS, entries, second, write_journal
+from thermostand.foundation.documents import yaml_data
+from thermostand.foundation.errors import ConfigError
+from thermostand.recording.exporting.tables import Column, CsvTable
+from thermostand.recording.repair.salvage import salvage_unfinished
+from thermostand.stand.commands.sessions.session_commands import app
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.estimating.learned import learn
 
 LONGEST_S = 60  # for 10 s of a machine that has nothing else to do
 
@@ -107,7 +107,7 @@ def test_a_run_is_not_held_up_by_what_somebody_left_beside_its_sessions(session:
 )
 def test_an_odd_neighbour_never_ends_a_run(session: Path, text: str, monkeypatch: pytest.MonkeyPatch):
     """Its attached configuration is what somebody made it."""
-    monkeypatch.setattr("recording.reading.session.Session.attachment", lambda self, name: text)
+    monkeypatch.setattr("thermostand.recording.reading.session.Session.attachment", lambda self, name: text)
     config = load_config(packaged("", "simulated"))
     learn(session.parent, config)
 
@@ -116,7 +116,7 @@ def test_a_neighbour_that_breaks_the_reader_never_ends_a_run(session: Path, monk
     def broken(self: object) -> object:
         raise RuntimeError("a mistake of the program")
 
-    monkeypatch.setattr("recording.reading.session.Session.steps", broken)
+    monkeypatch.setattr("thermostand.recording.reading.session.Session.steps", broken)
     learn(session.parent, load_config(packaged("", "simulated")))
 
 

@@ -13,9 +13,16 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.errors import SessionError
-from foundation.readings import Frame
-from recording.format.images import IMAGE_CLASS, SIGNATURE, decode_image, decode_png, encode_image, encode_png
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.images import (
+    IMAGE_CLASS,
+    SIGNATURE,
+    decode_image,
+    decode_png,
+    encode_image,
+    encode_png,
+)
 
 TIME_NS = 1_767_290_400_123_456_789
 DEPTHS = {"8 bit": ("u1", 255), "10 bit": ("<u2", 1023), "12 bit": ("<u2", 4095), "16 bit, big-endian": (">u2", 65535)}

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from recording.writing import locks
-from recording.writing.disk import MODULE
+from thermostand.recording.writing import locks
+from thermostand.recording.writing.disk import MODULE
 
 _HOLD = "import fcntl, signal, sys; fcntl.flock(sys.stdin, fcntl.LOCK_EX); print(flush=True); signal.pause()"
 

@@ -6,15 +6,15 @@ import zlib
 import pytest
 import zstandard
 
-from foundation.errors import SessionError
-from recording.format.layout import TELEMETRY
-from recording.format.mcap_bytes import INFLATED_LIMIT_BYTES, Source, chunk_content, records
-from recording.format.records import telemetry_messages
-from recording.reading.walk import stored_messages, survey
-from recording.repair.salvage import salvage_session
-from recording.repair.verify import verify
 from tests.recording.damage import write_segment
 from tests.recording.fuzzed import Record, put_together, take_apart
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.layout import TELEMETRY
+from thermostand.recording.format.mcap_bytes import INFLATED_LIMIT_BYTES, Source, chunk_content, records
+from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.reading.walk import stored_messages, survey
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.repair.verify import verify
 
 RECORDS = struct.pack("<BQ", 3, 5) + b"hello" + struct.pack("<BQ", 4, 0)
 

@@ -7,7 +7,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
-from recording.writing.mcap_writer import McapWriter
+from thermostand.recording.writing.mcap_writer import McapWriter
 
 CHUNK_BYTES = 1000
 MESSAGES = [

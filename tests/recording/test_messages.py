@@ -8,11 +8,11 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.errors import SessionError
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Quality, Reading, bad_reading
-from recording.format import messages
-from recording.writing.telemetry import BatchEncoder
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
+from thermostand.recording.format import messages
+from thermostand.recording.writing.telemetry import BatchEncoder
 
 TIME_NS = 1_767_290_400_123_456_789
 

@@ -8,8 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import ConfigError, SessionError
-from recording.reading.notes import NOTES_NAME, Archived, Note, Notes, add_archived, add_note, add_tags, read_notes
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.recording.reading.notes import (
+    NOTES_NAME,
+    Archived,
+    Note,
+    Notes,
+    add_archived,
+    add_note,
+    add_tags,
+    read_notes,
+)
 
 
 def test_notes_and_tags_are_kept_in_order(tmp_path: Path):
@@ -73,8 +82,8 @@ def test_a_note_that_a_full_disk_takes_in_part_is_refused_and_leaves_nothing(tmp
     code = """
 import resource, signal, sys
 from pathlib import Path
-from foundation.errors import SessionError
-from recording.reading.notes import add_note, add_tags
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.notes import add_note, add_tags
 folder = Path(sys.argv[1])
 add_note(folder, "first", "eva", 1)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

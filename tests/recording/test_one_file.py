@@ -3,12 +3,12 @@
 import pytest
 from mcap.reader import make_reader
 
-from foundation.errors import SessionError
-from recording.exporting.one_file import export_mcap
-from recording.format.images import ImageEncoding
-from recording.reading.notes import add_note
-from recording.reading.session import Session
 from tests.recording.recorded import ATTACHMENTS, images, record, telemetry
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.exporting.one_file import export_mcap
+from thermostand.recording.format.images import ImageEncoding
+from thermostand.recording.reading.notes import add_note
+from thermostand.recording.reading.session import Session
 
 
 def silent(done, text):

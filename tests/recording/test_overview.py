@@ -7,14 +7,14 @@ import threading
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.errors import ConfigError, SessionError
-from foundation.instants import date_time, duration, parse_instant, utc_text
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading, bad_reading
-from recording.format.inventory import State, inventory
-from recording.reading.glance import glance
-from recording.reading.overview import overview
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.instants import date_time, duration, parse_instant, utc_text
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading, bad_reading
+from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.reading.glance import glance
+from thermostand.recording.reading.overview import overview
 
 from .recorded import ATTACHMENTS, START_NS, record
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from foundation.readings import Frame
-from recording.format.images import decode_image, encode_raw
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.images import decode_image, encode_raw
 
 TIME_NS = 1_767_290_400_123_456_789
 

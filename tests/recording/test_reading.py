@@ -10,23 +10,23 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Frame, Quality, Reading, bad_reading
-from recording.format import messages
-from recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
-from recording.format.layout import FORMAT, FRAMES, TELEMETRY
-from recording.format.records import telemetry_messages
-from recording.reading.session import Session
-from recording.writing.forms import telemetry_topics
-from recording.writing.recorder import Recorder
-from recording.writing.segment import Record, SeriesForm, Topic
-from recording.writing.series import Series
-from recording.writing.telemetry import BatchEncoder, TelemetryEncoder
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
+from thermostand.recording.format import messages
+from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
+from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.forms import telemetry_topics
+from thermostand.recording.writing.recorder import Recorder
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.telemetry import BatchEncoder, TelemetryEncoder
 
 METADATA = {"format": str(FORMAT), "session_id": "night-1"}
 

@@ -6,12 +6,6 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Batch, Event, StepMark, StepState
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, Saved
 from tests.recording.recordings import (
     ATTACHMENTS,
     DEVICES,
@@ -24,6 +18,12 @@ from tests.recording.recordings import (
     start,
     stop,
 )
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, Saved
 
 
 def contents(directory):

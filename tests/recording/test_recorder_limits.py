@@ -6,13 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import Event
-from recording.format.images import encode_image
-from recording.reading.session import Session
-from recording.writing.notices import Losses, ranges
-from recording.writing.recorder import Saved
 from tests.recording.disks import limit_files
 from tests.recording.recordings import (
     SETTINGS,
@@ -23,6 +16,13 @@ from tests.recording.recordings import (
     start,
     stop,
 )
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Event
+from thermostand.recording.format.images import encode_image
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.notices import Losses, ranges
+from thermostand.recording.writing.recorder import Saved
 
 
 @pytest.fixture

@@ -4,14 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Frame
-from recording.exporting.replay import ReplayClock, replay, replay_and_record
-from recording.exporting.topics import recorded_devices, recorded_topics
-from recording.reading.session import Session
 from tests.recording.disks import tmpfs
 from tests.recording.recorded import (
     ATTACHMENTS,
@@ -25,6 +17,14 @@ from tests.recording.recorded import (
     record,
     telemetry,
 )
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Frame
+from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
+from thermostand.recording.exporting.topics import recorded_devices, recorded_topics
+from thermostand.recording.reading.session import Session
 
 
 async def play(session, clock, driver=None):

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.readings import Frame
-from recording.format.images import decode_image, encode_image
-from recording.format.roi import RoiEncoder
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.images import decode_image, encode_image
+from thermostand.recording.format.roi import RoiEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 WINDOWS = np.array([[10, 20, 30, 30], [30, 40, 25, 20], [90, 0, 10, 80]], np.int32)  # two overlap, one ends at the edge

@@ -5,11 +5,6 @@ import re
 
 import pytest
 
-from recording.format.layout import FRAMES, TELEMETRY, segment_metadata
-from recording.format.records import read_head
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_line, salvage_session
-from recording.repair.verify import Severity, verify
 from tests.nightly import by_night
 from tests.recording.damage import (
     ATTACHMENTS,
@@ -22,6 +17,11 @@ from tests.recording.damage import (
     read_segment,
     write_segment,
 )
+from thermostand.recording.format.layout import FRAMES, TELEMETRY, segment_metadata
+from thermostand.recording.format.records import read_head
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_line, salvage_session
+from thermostand.recording.repair.verify import Severity, verify
 
 TRIALS = [15, by_night(1000)]
 """Places at which a file is damaged, by day and by night."""

@@ -10,11 +10,6 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from foundation.errors import SessionError
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.session import Session
-from recording.repair.salvage import BEING_RECORDED, salvage_line, salvage_session, salvage_unfinished
-from recording.writing.segment import CommitSink
 from tests.recording.damage import (
     METADATA,
     hole,
@@ -22,6 +17,11 @@ from tests.recording.damage import (
     read_segment,
     write_segment,
 )
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import BEING_RECORDED, salvage_line, salvage_session, salvage_unfinished
+from thermostand.recording.writing.segment import CommitSink
 
 SERIES = [TELEMETRY, FRAMES]
 

@@ -13,12 +13,12 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 
-from recording.format.layout import segment_metadata
-from recording.format.messages import CLASSES, EVENT, LOG
-from recording.writing.home import FolderLost
-from recording.writing.segment import Record, SeriesForm, Topic, merge_chunks
-from recording.writing.series import Series, next_number
 from tests.recording.disks import ext4, limit_files, run, tmpfs
+from thermostand.recording.format.layout import segment_metadata
+from thermostand.recording.format.messages import CLASSES, EVENT, LOG
+from thermostand.recording.writing.home import FolderLost
+from thermostand.recording.writing.segment import Record, SeriesForm, Topic, merge_chunks
+from thermostand.recording.writing.series import Series, next_number
 
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
 SESSION = {"session_id": "night-1"}

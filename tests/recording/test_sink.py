@@ -6,8 +6,8 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from recording.writing.segment import CommitSink
 from tests.recording.disks import ext4, limit_files, mounted, run, tmpfs
+from thermostand.recording.writing.segment import CommitSink
 
 MB = 1_000_000
 

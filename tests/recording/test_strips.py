@@ -10,8 +10,8 @@ import PIL.Image
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recording.format.images import SIGNATURE, decode_png, encode_png, strip_places
-from recording.format.strips import KIND, Strips, index_of, strip_rows, strips_in
+from thermostand.recording.format.images import SIGNATURE, decode_png, encode_png, strip_places
+from thermostand.recording.format.strips import KIND, Strips, index_of, strip_rows, strips_in
 
 DTYPES = {np.uint8: 255, np.uint16: 65535}
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.repair.salvage import salvage_session
-from recording.repair.verify import verify
 from tests.recording.damage import names, read_segment, write_segment
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.repair.verify import verify
 
 SERIES = [TELEMETRY, FRAMES]
 COUNT = 20

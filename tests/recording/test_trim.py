@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.events import TRIMMED
-from foundation.items import StepMark, StepState
-from recording.exporting.replay import replay_and_record
-from recording.exporting.trim import trim
-from recording.format.layout import FRAMES
-from recording.reading.session import Session
 from tests.recording.recorded import INFO, MS, START_NS, frame, half_second, images, record, telemetry
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import TRIMMED
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.recording.exporting.replay import replay_and_record
+from thermostand.recording.exporting.trim import trim
+from thermostand.recording.format.layout import FRAMES
+from thermostand.recording.reading.session import Session
 
 HALF_NS = NS_PER_S // 2
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from mcap.reader import SeekingReader
 
-from foundation.clock import NS_PER_S
-from foundation.errors import SessionError
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading
-from recording.format.inventory import inventory
-from recording.reading.gaps import silences
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_session
-from recording.repair.verify import Severity, verify
 from tests.nightly import by_night
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.format.inventory import inventory
+from thermostand.recording.reading.gaps import silences
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.repair.verify import Severity, verify
 
 from .recorded import item_key, record
 

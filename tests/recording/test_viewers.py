@@ -20,13 +20,13 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
-from foundation.items import Batch
-from foundation.readings import Reading
-from recording.format import messages
-from recording.format.images import CAMERA_IMAGE
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.session import Session
 from tests.recording.recorded import ATTACHMENTS, INFO, half_second, record
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading
+from thermostand.recording.format import messages
+from thermostand.recording.format.images import CAMERA_IMAGE
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.session import Session
 
 FOXGLOVE = {message.DESCRIPTOR.full_name: message for message in (CompressedImage, RawImage, PoseInFrame, Log)}
 

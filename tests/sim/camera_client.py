@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.gige import gvcp, gvsp
-from drivers.sim.gige.genicam import features
-from drivers.sim.gige.gvcp import Ack, Command, Request, Resend, Status
-from drivers.sim.gige.gvsp import Kind, Packet
-from foundation.clock import seconds_ns
 from tests.addresses import camera_address
 from tests.sim.gvcp_client import decode_ack, decode_leader, pack_read_memory
+from thermostand.drivers.sim.gige import gvcp, gvsp
+from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.gvcp import Ack, Command, Request, Resend, Status
+from thermostand.drivers.sim.gige.gvsp import Kind, Packet
+from thermostand.foundation.clock import seconds_ns
 
 WIDTH, HEIGHT = 320, 240
 START_NS = seconds_ns(1_700_000_000.0)

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.sim.gige.camera import FakeCamera
-from drivers.sim.gige.gvsp_sender import CameraFaults
-from foundation.clock import FollowedClock
 from tests.sim.camera_client import HEIGHT, START_NS, WIDTH, Client, StubPlant, address, render
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults
+from thermostand.foundation.clock import FollowedClock
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable
 
-from drivers.sim.gige import gvsp
-from drivers.sim.gige.gvcp import Ack, Malformed
+from thermostand.drivers.sim.gige import gvsp
+from thermostand.drivers.sim.gige.gvcp import Ack, Malformed
 
 _ACK = struct.Struct(">HHHH")
 _LEADER = struct.Struct(">HHQIIIIIHH")

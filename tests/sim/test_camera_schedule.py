@@ -1,8 +1,8 @@
 import pytest
 
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.camera_schedule import Schedule, Shot
-from drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.camera_schedule import Schedule, Shot
+from thermostand.drivers.sim.gige.genicam import features
 
 MS = 1_000_000
 SOFTWARE, LINE0 = 0, 1

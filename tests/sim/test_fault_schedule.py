@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.control import Control
-from drivers.sim.fault_schedule import FaultSchedule, PlannedFault, parse_fault
-from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_faults import FAULTS, inject
-from drivers.sim.laboratory_spec import LaboratorySpec
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from stand.config.stand_config import load_config, packaged
-from stand.simulator import laboratory_of
 from tests.addresses import camera_address
+from thermostand.drivers.sim.control import Control
+from thermostand.drivers.sim.fault_schedule import FaultSchedule, PlannedFault, parse_fault
+from thermostand.drivers.sim.laboratory import Laboratory
+from thermostand.drivers.sim.laboratory_faults import FAULTS, inject
+from thermostand.drivers.sim.laboratory_spec import LaboratorySpec
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.simulator import laboratory_of
 
 START_NS = 1_767_290_400_000_000_000
 S = 1_000_000_000
@@ -123,7 +123,9 @@ def test_an_unplugged_port_is_another_one_when_it_is_back(laboratory: Laboratory
 
 
 def test_the_simulator_lists_its_faults():
-    listed = subprocess.run([sys.executable, "-m", "drivers.sim", "--faults"], capture_output=True, check=True).stdout
+    listed = subprocess.run(
+        [sys.executable, "-m", "thermostand.drivers.sim", "--faults"], capture_output=True, check=True
+    ).stdout
     assert [row["name"] for row in json.loads(listed)] == sorted(FAULTS)
 
 

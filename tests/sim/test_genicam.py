@@ -4,9 +4,9 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from drivers.sim.gige import gvcp
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.genicam import Feature, features, to_xml
+from thermostand.drivers.sim.gige import gvcp
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.genicam import Feature, features, to_xml
 
 SPACE = "{http://www.genicam.org/GenApi/Version_1_1}"
 TABLE = features(64, 48, "SN1")

@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.sim.gige import gvcp
-from drivers.sim.gige.gvcp import Ack, Command, Malformed, Nack, Request, Resend, Status
 from tests.sim.gvcp_client import decode_ack, pack_read_memory, pack_words
+from thermostand.drivers.sim.gige import gvcp
+from thermostand.drivers.sim.gige.gvcp import Ack, Command, Malformed, Nack, Request, Resend, Status
 
 # One line per datagram: the bytes, and what they mean. The same table serves encoder and decoder.
 REQUESTS = [

@@ -1,11 +1,11 @@
 import pytest
 
-from drivers.sim.gige import gvcp
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.genicam import features
-from drivers.sim.gige.gvcp import Ack, Command, Nack, Request, Resend, Status
-from drivers.sim.gige.gvcp_device import CCP, ControlChannel
 from tests.sim.gvcp_client import decode_ack, pack_read_memory, pack_words
+from thermostand.drivers.sim.gige import gvcp
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.gvcp import Ack, Command, Nack, Request, Resend, Status
+from thermostand.drivers.sim.gige.gvcp_device import CCP, ControlChannel
 
 ALICE, BOB = ("127.0.0.1", 40001), ("127.0.0.1", 40002)
 PACKET_SIZE = 0x0D04

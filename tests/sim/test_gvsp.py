@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.sim.gige import gvsp
-from drivers.sim.gige.gvsp import Block, Kind, Leader, Malformed, Packet, PixelFormat
 from tests.sim.gvcp_client import decode_leader
+from thermostand.drivers.sim.gige import gvsp
+from thermostand.drivers.sim.gige.gvsp import Block, Kind, Leader, Malformed, Packet, PixelFormat
 
 PACKETS = [
     ("0000 0001 01000000", Packet(Kind.LEADER, 1, 0)),

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.sim.motion.kinematics import Pace, Path, path_onward, path_to, path_to_halt, rest
+from thermostand.drivers.sim.motion.kinematics import Pace, Path, path_onward, path_to, path_to_halt, rest
 
 PACES = st.builds(Pace, st.integers(1, 5_000), st.integers(10, 20_000), st.integers(10, 20_000))
 POSITIONS = st.integers(-120_000 * 256, 120_000 * 256).map(lambda microsteps: microsteps / 256)

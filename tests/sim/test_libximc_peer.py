@@ -18,11 +18,11 @@ import pytest
 LABORATORY = """
 import sys, threading
 from pathlib import Path
-from foundation.clock import WallClock
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import PtyWire, TcpWire
-from drivers.sim.motion.ximc import FakeAxis
-from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from thermostand.foundation.clock import WallClock
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.motion.ximc import FakeAxis
+from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 
 class Laboratory:
     lock = threading.RLock()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.sim.physics.optics import (
+from thermostand.drivers.sim.physics.optics import (
     CameraKind,
     FOCAL_px,
     Nodes,
@@ -21,7 +21,7 @@ from drivers.sim.physics.optics import (
     strain,
     true_centres_px,
 )
-from drivers.sim.physics.plant import NS_PER_S, Plant, PlantSpec
+from thermostand.drivers.sim.physics.plant import NS_PER_S, Plant, PlantSpec
 
 START_ns = 1_700_000_000 * NS_PER_S
 MINUTE_ns = 60 * NS_PER_S

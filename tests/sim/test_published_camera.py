@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.camera_preset import CameraPreset, Effect
-from drivers.sim.physics.optics import PITCH_mm
-from drivers.sim.physics.published_camera import PublishedCamera
-from foundation.documents import load_document
+from thermostand.drivers.camera_preset import CameraPreset, Effect
+from thermostand.drivers.sim.physics.optics import PITCH_mm
+from thermostand.drivers.sim.physics.published_camera import PublishedCamera
+from thermostand.foundation.documents import load_document
 
 OPTICS = Path(__file__).parents[2] / "configs" / "optics"
 PRESETS = sorted(path.stem for path in OPTICS.glob("*.yaml"))

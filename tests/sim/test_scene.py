@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.sim.physics.optics import Nodes, Optics, Placement, optics_at
-from drivers.sim.physics.scene import Scene, SceneSpec, disc_coverages, polygon_coverage, still, true_centres_px
+from thermostand.drivers.sim.physics.optics import Nodes, Optics, Placement, optics_at
+from thermostand.drivers.sim.physics.scene import (
+    Scene,
+    SceneSpec,
+    disc_coverages,
+    polygon_coverage,
+    still,
+    true_centres_px,
+)
 
 TIME_ns = 1_700_000_000_000_000_000
 FLAT = SceneSpec(light_slope=(0.0, 0.0), vignetting=0.0)

@@ -6,11 +6,6 @@ import subprocess
 
 import pytest
 
-from drivers.sim.gige import gvcp
-from drivers.sim.gige.camera import FakeCamera
-from drivers.sim.gige.gvcp import Command, Request, Status
-from drivers.sim.gige.gvsp_sender import CameraFaults
-from foundation.clock import FollowedClock, seconds_ns
 from tests.sim.camera_client import (
     FEATURES,
     HEIGHT,
@@ -22,6 +17,11 @@ from tests.sim.camera_client import (
     address,
 )
 from tests.sim.gvcp_client import decode_ack, pack_read_memory
+from thermostand.drivers.sim.gige import gvcp
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.sim.gige.gvcp import Command, Request, Status
+from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults
+from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 
 def test_a_stop_ends_the_frames_and_unlocks_the_settings(client: Client, camera: FakeCamera) -> None:

@@ -7,12 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.sim.gige import gvsp
-from drivers.sim.gige.camera import FakeCamera
-from drivers.sim.gige.gvcp import Command, Resend, Status
-from drivers.sim.gige.gvsp import Kind, Packet
-from drivers.sim.gige.gvsp_sender import CameraFaults, StreamSender
-from foundation.clock import FollowedClock, seconds_ns
 from tests.sim.camera_client import (
     HEIGHT,
     START_NS,
@@ -27,6 +21,12 @@ from tests.sim.camera_client import (
     render,
 )
 from tests.sim.gvcp_client import decode_leader, pack_words
+from thermostand.drivers.sim.gige import gvsp
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.sim.gige.gvcp import Command, Resend, Status
+from thermostand.drivers.sim.gige.gvsp import Kind, Packet
+from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamSender
+from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 
 @pytest.mark.parametrize("packet_size", [576, 1500, 8000])

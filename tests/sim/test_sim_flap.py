@@ -7,16 +7,16 @@ from typing import cast
 
 import pytest
 
-from drivers.sim.motion.flap import (
+from thermostand.drivers.sim.motion.flap import (
     ERROR_AWAITING_COMMAND,
     ERROR_FEEDBACK_DISCONNECT,
     ERROR_NO_POWER,
     ERROR_SOFT_OVER_CURRENT,
     FakeFlap,
 )
-from drivers.sim.physics.plant import Plant
-from drivers.sim.usb import Stall, TimedOut
-from foundation.clock import FollowedClock, seconds_ns
+from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.drivers.sim.usb import Stall, TimedOut
+from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000
 

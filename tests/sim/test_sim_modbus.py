@@ -13,8 +13,8 @@ from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.units.modbus import (
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     Refusal,
     RtuEngine,
@@ -28,7 +28,7 @@ from drivers.sim.units.modbus import (
     writes_one,
     writes_words,
 )
-from drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
 
 
 class Store:

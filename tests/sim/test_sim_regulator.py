@@ -9,12 +9,12 @@ import pytest
 from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.modbus import RtuEngine
-from drivers.sim.units.regulator import FakeRegulator
-from drivers.sim.wire import PtyWire
-from foundation.clock import FollowedClock, seconds_ns
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.modbus import RtuEngine
+from thermostand.drivers.sim.units.regulator import FakeRegulator
+from thermostand.drivers.sim.wire import PtyWire
+from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 START_NS = 1_700_000_000_000_000_000
 RUN, STOP, WRITING_ON, RAM_MODE, BACKUP_MODE = 0x0100, 0x0101, 0x0001, 0x0401, 0x0400

@@ -8,12 +8,12 @@ import pytest
 from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.modbus import RtuEngine
-from drivers.sim.units.relays import FakeRelays
-from drivers.sim.wire import PtyWire
-from foundation.clock import FollowedClock, seconds_ns
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.modbus import RtuEngine
+from thermostand.drivers.sim.units.relays import FakeRelays
+from thermostand.drivers.sim.wire import PtyWire
+from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 START_NS = 1_700_000_000_000_000_000
 HEATER, COMPRESSOR, CAMERA = 0, 2, 5

@@ -8,12 +8,12 @@ import struct
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
-from drivers.sim.units.thermometers import FakeThermometers
-from drivers.sim.wire import TcpWire
-from foundation.clock import FollowedClock, seconds_ns
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
+from thermostand.drivers.sim.units.thermometers import FakeThermometers
+from thermostand.drivers.sim.wire import TcpWire
+from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 START_NS = 1_700_000_000_000_000_000
 CHANNELS = {"granite_inside": 0, "granite_outside": 1, "artifact": 2, "air": 3, "laboratory": 5}

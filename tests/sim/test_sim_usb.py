@@ -10,7 +10,7 @@ import pytest
 import usb.core
 import usb.util
 
-from drivers.sim.usb import ForwardingBackend, Stall, TimedOut, TransferFailed, UsbServer, get_backend
+from thermostand.drivers.sim.usb import ForwardingBackend, Stall, TimedOut, TransferFailed, UsbServer, get_backend
 
 
 class Echo:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.wire import PtyWire
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.wire import PtyWire
 
 
 class Echo:

@@ -4,7 +4,6 @@ import struct
 
 import pytest
 
-from drivers.framing.ximc import encode
 from tests.sim.ximc_bench import (
     ERRC,
     ERRD,
@@ -12,6 +11,7 @@ from tests.sim.ximc_bench import (
     SETTING_SIZES,
     Bench,
 )
+from thermostand.drivers.framing.ximc import encode
 
 QUERY_SIZES = {
     "gets": 54, "gpos": 26, "getm": 216, "geti": 36, "gser": 10, "gfwv": 10, "gblv": 10, "getc": 38, "guid": 40,

@@ -2,7 +2,6 @@
 
 import pytest
 
-from foundation.clock import seconds_ns
 from tests.sim.ximc_bench import (
     ALARM,
     CTP_ERROR,
@@ -19,6 +18,7 @@ from tests.sim.ximc_bench import (
     T0,
     Bench,
 )
+from thermostand.foundation.clock import seconds_ns
 
 
 @pytest.fixture

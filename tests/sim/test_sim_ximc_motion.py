@@ -4,7 +4,6 @@ import struct
 
 import pytest
 
-from drivers.framing.ximc import encode
 from tests.sim.ximc_bench import (
     ALARM,
     EEPROM,
@@ -23,6 +22,7 @@ from tests.sim.ximc_bench import (
     T0,
     Bench,
 )
+from thermostand.drivers.framing.ximc import encode
 
 RIGHT_EDGE, LEFT_EDGE = 1, 2
 

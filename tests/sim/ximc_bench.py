@@ -5,11 +5,11 @@ import threading
 from collections.abc import Callable
 from typing import Literal, NamedTuple, cast
 
-from drivers.framing.ximc import Damage, decode, encode
-from drivers.sim.motion.ximc import FakeAxis
-from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
-from drivers.sim.physics.plant import Plant
-from foundation.clock import FollowedClock, seconds_ns
+from thermostand.drivers.framing.ximc import Damage, decode, encode
+from thermostand.drivers.sim.motion.ximc import FakeAxis
+from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000
 

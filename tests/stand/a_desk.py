@@ -9,19 +9,19 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from experiments.steps import Soak, number_steps
-from foundation.clock import WallClock
-from foundation.hub import Hub
-from foundation.items import Batch, Event
-from foundation.readings import Reading, bad_reading
-from stand.config.stand_config import load_config, packaged
-from stand.gate import INTERLOCK, OPERATOR, Gate
-from stand.running.memory.state import RunState
-from stand.running.plan_check import check_edit
-from stand.serving.api.doors import Interface
-from stand.serving.api.server import serve
-from stand.serving.command_event import command_event
-from stand.serving.desk import (
+from thermostand.experiments.steps import Soak, number_steps
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.gate import INTERLOCK, OPERATOR, Gate
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.plan_check import check_edit
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.server import serve
+from thermostand.stand.serving.command_event import command_event
+from thermostand.stand.serving.desk import (
     Conflict,
     DeviceState,
     Done,
@@ -42,8 +42,8 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.not_confirmed import NotConfirmed
-from stand.serving.plan_faults import PlanCheck
+from thermostand.stand.serving.not_confirmed import NotConfirmed
+from thermostand.stand.serving.plan_faults import PlanCheck
 
 STAND = "a stand"
 KNOWN_FAULTS = (

@@ -3,14 +3,14 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.regulator import FakeRegulator
-from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Reading
-from stand.chamber.compressor import CompressorState, decide
-from stand.config.stand_config import CompressorConfig
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.regulator import FakeRegulator
+from thermostand.foundation.clock import NS_PER_S, FollowedClock, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading
+from thermostand.stand.chamber.compressor import CompressorState, decide
+from thermostand.stand.config.stand_config import CompressorConfig
 
 START_NS = 1_767_290_400 * NS_PER_S
 POLL_S = 5.0

@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from drivers.camera_preset import CameraPreset
-from drivers.sim.physics.plant import STEP_s
-from drivers.sim.physics.published_camera import PublishedCamera
-from foundation.documents import load_document
-from foundation.items import Event
-from foundation.readings import Reading
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.guarding.channels import ChannelCheck
-from stand.guarding.rules import natures
 from tests.stand.guarded_chamber import Action, Chamber
+from thermostand.drivers.camera_preset import CameraPreset
+from thermostand.drivers.sim.physics.plant import STEP_s
+from thermostand.drivers.sim.physics.published_camera import PublishedCamera
+from thermostand.foundation.documents import load_document
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Reading
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.guarding.channels import ChannelCheck
+from thermostand.stand.guarding.rules import natures
 
 CONFIG = load_config(packaged("", "simulated"))
 CAMERA = "camera.temperature"

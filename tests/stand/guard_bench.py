@@ -3,15 +3,15 @@
 import asyncio
 from typing import Any
 
-from foundation.clock import Clock, VirtualClock, seconds_ns
-from foundation.errors import DeviceFault
-from foundation.hub import Hub
-from foundation.items import Event
-from stand.fault import Fault, Readings
-from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Rule, Watch
-from stand.guarding.notify import Notifier
-from stand.safety import Safety
+from thermostand.foundation.clock import Clock, VirtualClock, seconds_ns
+from thermostand.foundation.errors import DeviceFault
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.stand.fault import Fault, Readings
+from thermostand.stand.guarding.guard import Guard
+from thermostand.stand.guarding.interlocks import Rule, Watch
+from thermostand.stand.guarding.notify import Notifier
+from thermostand.stand.safety import Safety
 
 
 class PlainActuator:

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from drivers.sim.physics.plant import Plant, PlantSpec
-from drivers.sim.units.regulator import FakeRegulator
-from drivers.sim.units.thermometers import FakeThermometers
-from foundation.clock import NS_PER_S, FollowedClock, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Reading, bad_reading
-from stand.chamber.compressor import CompressorState, decide
-from stand.config.stand_config import CompressorConfig
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.units.regulator import FakeRegulator
+from thermostand.drivers.sim.units.thermometers import FakeThermometers
+from thermostand.foundation.clock import NS_PER_S, FollowedClock, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.chamber.compressor import CompressorState, decide
+from thermostand.stand.config.stand_config import CompressorConfig
 
 START_NS = 1_767_290_400 * NS_PER_S
 POLL_S, SLOW_POLL_S = 5.0, 10.0

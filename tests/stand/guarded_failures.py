@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from stand.config.stand_config import StandConfig
-from stand.fault import Fault
-from stand.guarding.rules import Announcements, watches
 from tests.stand.guarded_chamber import AIR, GRANITE, Action, Chamber, timed
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.rules import Announcements, watches
 
 LITTLE_K = 0.3  # how much too low a stuck probe is
 AFTER_TRIP_S = 1200.0

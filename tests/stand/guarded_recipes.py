@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from experiments.steps import (
+from tests.stand.guarded_chamber import Action, Chamber
+from thermostand.experiments.steps import (
     Capture,
     CloseFlap,
     KnownStand,
@@ -18,10 +19,9 @@ from experiments.steps import (
     Step,
     StopChamber,
 )
-from foundation.documents import load_document
-from stand.config.recipe import Recipe
-from stand.config.stand_config import packaged
-from tests.stand.guarded_chamber import Action, Chamber
+from thermostand.foundation.documents import load_document
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import packaged
 
 RECIPES = (
     "calibration",

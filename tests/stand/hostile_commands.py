@@ -34,8 +34,8 @@ class Answer:
 
 def run_here(words: list[str]) -> None:
     """In the forked process; does not return."""
-    from compensation.cli import app as compensate
-    from stand.commands.command_table import app as stand
+    from thermostand.compensation.cli import app as compensate
+    from thermostand.stand.commands.command_table import app as stand
 
     status = CRASHED
     try:

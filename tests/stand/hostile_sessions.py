@@ -19,11 +19,11 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from recording.format import messages
-from recording.format.images import CAMERA_IMAGE
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
-from recording.reading.journal_lines import journal_lines, lines_of
+from thermostand.recording.format import messages
+from thermostand.recording.format.images import CAMERA_IMAGE
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
+from thermostand.recording.reading.journal_lines import journal_lines, lines_of
 
 SOUND, INCOMPLETE, DAMAGED, UNKNOWN, NONE = "sound", "incomplete", "damaged", "unknown", ""
 GB = 1 << 30

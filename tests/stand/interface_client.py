@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from foundation.errors import SessionError
-from stand.serving.presence import Entry, living
 from tests.asking import ask
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.serving.presence import Entry, living
 
 
 def entries_of(session: Path) -> list[Entry]:

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from foundation.clock import WallClock
-from stand.queueing.queue_file import Entry
-from stand.queueing.queue_work import Notes, work
+from thermostand.foundation.clock import WallClock
+from thermostand.stand.queueing.queue_file import Entry
+from thermostand.stand.queueing.queue_work import Notes, work
 
 
 async def run(entry: Entry, notes: Notes) -> NoReturn:

@@ -14,18 +14,19 @@ import cv2
 import numpy as np
 from pydantic import JsonValue
 
-from experiments.steps import PlannedStep, step_of
-from foundation.clock import NS_PER_S, WallClock
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading, bad_reading
-from stand.config.stand_config import load_config, packaged
-from stand.fault import Fault
-from stand.gate import INTERLOCK, OPERATOR
-from stand.running.memory.entries import Step as StepMarked
-from stand.running.memory.fold import fold
-from stand.running.plan_check import check_edit
-from stand.serving.api.doors import Interface
-from stand.serving.desk import (
+from tests.stand.a_desk import ADesk, served
+from thermostand.experiments.steps import PlannedStep, step_of
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading, bad_reading
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import INTERLOCK, OPERATOR
+from thermostand.stand.running.memory.entries import Step as StepMarked
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.plan_check import check_edit
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.desk import (
     Argument,
     DeviceState,
     DeviceVerb,
@@ -41,10 +42,9 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.page_room import PageRoom
-from stand.serving.plan_faults import PlanCheck
-from stand.serving.viewing import Viewing
-from tests.stand.a_desk import ADesk, served
+from thermostand.stand.serving.page_room import PageRoom
+from thermostand.stand.serving.plan_faults import PlanCheck
+from thermostand.stand.serving.viewing import Viewing
 
 TARGET = (Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml").read_text("utf-8")
 NIGHT_S = 12 * 3600

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from stand.serving.desk import Who
 from tests.stand.browser import PHONE, a_page, browser
 from tests.stand.page_desk import a_night, free_port
+from thermostand.stand.serving.desk import Who
 
 WIDE = (1280, 900)
 COLOURS = 256

@@ -2,15 +2,15 @@
 
 from collections.abc import Iterable
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     Capture,
     PlannedStep,
     Role,
     Step,
     number_steps,
 )
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.items import StepMark, StepState
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.items import StepMark, StepState
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S
 CAPTURE = Capture(3, 0.5, 0.1, Role.FIT, 31.0)

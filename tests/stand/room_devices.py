@@ -9,19 +9,19 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from drivers.devices.in_force import InForce
-from drivers.devices.relays import CAMERA_POWER
-from drivers.settings import CameraSettings, Identity
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.errors import StandError
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.readings import Frame, Quality, Reading
-from stand.chamber.chamber import ChamberLimits
-from stand.chamber.permits import COMPRESSOR, HEATER, PermitLimits
-from stand.config.stand_config import CompressorConfig
-from stand.imaging.camera_supply import SupplyLimits
-from stand.stand import Devices, Stand
+from thermostand.drivers.devices.in_force import InForce
+from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.drivers.settings import CameraSettings, Identity
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.readings import Frame, Quality, Reading
+from thermostand.stand.chamber.chamber import ChamberLimits
+from thermostand.stand.chamber.permits import COMPRESSOR, HEATER, PermitLimits
+from thermostand.stand.config.stand_config import CompressorConfig
+from thermostand.stand.imaging.camera_supply import SupplyLimits
+from thermostand.stand.stand import Devices, Stand
 
 COMPRESSOR_LIMITS = CompressorConfig(start_above_cool_percent=20)
 

@@ -2,13 +2,13 @@
 
 from typing import Protocol
 
-from foundation.readings import Frame
-from stand.fault import Fault
-from stand.gate import Gate
-from stand.imaging.equilibrium import CameraEquilibrium
-from stand.safety import Safety
-from stand.stand import Stand
 from tests.stand.small_stand import SmallStand
+from thermostand.foundation.readings import Frame
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import Gate
+from thermostand.stand.imaging.equilibrium import CameraEquilibrium
+from thermostand.stand.safety import Safety
+from thermostand.stand.stand import Stand
 
 
 class RunChamber(Protocol):

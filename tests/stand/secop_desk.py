@@ -7,11 +7,13 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from foundation.errors import DeviceFault, Refused, Unreachable
-from foundation.items import Batch
-from foundation.readings import Reading, bad_reading
-from stand.serving.api.doors import Interface
-from stand.serving.desk import (
+from tests.addresses import free_port
+from tests.stand.a_desk import ADesk, served
+from thermostand.foundation.errors import DeviceFault, Refused, Unreachable
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.desk import (
     Argument,
     Conflict,
     DeviceState,
@@ -21,9 +23,7 @@ from stand.serving.desk import (
     StandState,
     Who,
 )
-from stand.serving.secop.door import door_at
-from tests.addresses import free_port
-from tests.stand.a_desk import ADesk, served
+from thermostand.stand.serving.secop.door import door_at
 
 AT = Argument(name="position", unit="mm", minimum=0, maximum=280)
 WARM = Argument(name="setpoint_degC", unit="degC", minimum=-10, maximum=60)

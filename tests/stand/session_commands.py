@@ -2,7 +2,7 @@
 
 from typer.testing import CliRunner
 
-from stand.commands.sessions.session_commands import app
+from thermostand.stand.commands.sessions.session_commands import app
 
 runner = CliRunner()
 COUNT = 12  # half seconds, a frame each

@@ -6,30 +6,30 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast
 
-from drivers.settings import EquilibriumSettings
-from experiments.steps import Capture
-from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
-from foundation.errors import StandTripped, Unreachable
-from foundation.events import CAMERA_EQUILIBRIUM_LOST
-from foundation.hub import Hub
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading
-from markers.target import Target
-from stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
-from stand.imaging.equilibrium import CameraEquilibrium
-from stand.interlock import Interlocked
-from stand.running.executing.camera_gap import OffsetWatch
-from stand.running.executing.deciding import Decider, fixed_plan
-from stand.running.executing.executor import Executor, unguarded
-from stand.running.executing.settling_watch import SettlingWatch
-from stand.running.memory.entries import Gap
-from stand.running.memory.fold import fold
-from stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
-from stand.running.opening.holds import keep_shut_in_holds
-from stand.running.opening.stop import Stop
-from stand.running.resume import with_recorded
-from stand.safety import Safety
-from stand.stand import Stand
+from thermostand.drivers.settings import EquilibriumSettings
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.errors import StandTripped, Unreachable
+from thermostand.foundation.events import CAMERA_EQUILIBRIUM_LOST
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.markers.target import Target
+from thermostand.stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
+from thermostand.stand.imaging.equilibrium import CameraEquilibrium
+from thermostand.stand.interlock import Interlocked
+from thermostand.stand.running.executing.camera_gap import OffsetWatch
+from thermostand.stand.running.executing.deciding import Decider, fixed_plan
+from thermostand.stand.running.executing.executor import Executor, unguarded
+from thermostand.stand.running.executing.settling_watch import SettlingWatch
+from thermostand.stand.running.memory.entries import Gap
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
+from thermostand.stand.running.opening.holds import keep_shut_in_holds
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.running.resume import with_recorded
+from thermostand.stand.safety import Safety
+from thermostand.stand.stand import Stand
 
 TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
 TIME_CONSTANT_S = 5.0  # of a camera that tells no temperature

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import Capture, SetTemperature
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from stand.config.recipe import Recipe
+from thermostand.experiments.steps import Capture, SetTemperature
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.recipe import Recipe
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "staircase"
 Install = Callable[[str, str, str], None]
@@ -91,7 +91,7 @@ def test_what_is_wrong_with_its_parameters_is_said_with_their_place(entry: str, 
     assert sentence in str(raised.value)
 
 
-HEAD = "from pydantic import BaseModel\nfrom experiments.steps import *\nclass P(BaseModel): pass\n"
+HEAD = "from pydantic import BaseModel\nfrom thermostand.experiments.steps import *\nclass P(BaseModel): pass\n"
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,10 @@ HEAD = "from pydantic import BaseModel\nfrom experiments.steps import *\nclass P
             f"{HEAD}def own(p: P): return 1 / 0",
             "acme 1.0 makes no steps of these (ZeroDivisionError: division by zero)",
         ),
-        (f"{HEAD}def own(p: P): yield 'soak'", "step 1 is no step of experiments.steps but str; correct the package"),
+        (
+            f"{HEAD}def own(p: P): yield 'soak'",
+            "step 1 is no step of thermostand.experiments.steps but str; correct the package",
+        ),
         (f"{HEAD}def own(p: P): yield Soak(float('nan'))", "step 1 (soak) has duration_s nan"),
         (f"{HEAD}def own(p: P): yield Soak(-1.0)", "step 1 (soak) has duration_s -1.0"),
         (f"{HEAD}def own(p: P): yield SetTemperature(30.0)", "experiments.1.own: the chamber is stopped here"),

@@ -9,25 +9,34 @@ from typing import Any, cast
 import pytest
 import yaml
 
-from experiments.steps import STEPS, Soak, StartChamber, Step, number_steps, schema_of_steps, step_of, words_of
-from foundation.clock import NS_PER_S
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from foundation.items import Event, StepMark
-from stand.config.recipe import Recipe
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.estimate import price
-from stand.gate import INTERLOCK
-from stand.running.memory.entries import Skipped, decoded, edited, encoded
-from stand.running.memory.fold import refusal
-from stand.running.memory.state import RunState
 from tests.stand.small_stand import Life
+from thermostand.experiments.steps import (
+    STEPS,
+    Soak,
+    StartChamber,
+    Step,
+    number_steps,
+    schema_of_steps,
+    step_of,
+    words_of,
+)
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.items import Event, StepMark
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.estimating.estimate import price
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.running.memory.entries import Skipped, decoded, edited, encoded
+from thermostand.stand.running.memory.fold import refusal
+from thermostand.stand.running.memory.state import RunState
 
 MODULE = '''
 from dataclasses import dataclass
 from typing import Annotated
 from pydantic import Field
-from experiments.steps import Price, Step
+from thermostand.experiments.steps import Price, Step
 
 @dataclass(frozen=True, slots=True)
 class LampOn(Step):

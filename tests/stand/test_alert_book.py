@@ -2,10 +2,10 @@
 
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.events import alert_of
-from foundation.items import Event
-from stand.serving.alert_book import AlertBook
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import alert_of
+from thermostand.foundation.items import Event
+from thermostand.stand.serving.alert_book import AlertBook
 
 CAUSES = (
     "trip", "hold", "device_lost", "disk", "prompt", "run_started", "run_finished", "run_aborted", "queue_empty",

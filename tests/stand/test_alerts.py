@@ -10,19 +10,19 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from foundation.clock import VirtualClock, WallClock
-from foundation.errors import ConfigError, DeviceError
-from foundation.hub import Hub
-from foundation.items import Event
-from stand.commands.command_table import app
-from stand.config.alerts_section import AlertsConfig, load_secrets
-from stand.config.stand_config import packaged
-from stand.running.order import load_order
-from stand.running.run import run_real
-from stand.serving import alerts as module
-from stand.serving.alerts import alerting
-from stand.serving.alerts_process import deliver, ping
 from tests.addresses import move_to_free
+from thermostand.foundation.clock import VirtualClock, WallClock
+from thermostand.foundation.errors import ConfigError, DeviceError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.config.alerts_section import AlertsConfig, load_secrets
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.running.order import load_order
+from thermostand.stand.running.run import run_real
+from thermostand.stand.serving import alerts as module
+from thermostand.stand.serving.alerts import alerting
+from thermostand.stand.serving.alerts_process import deliver, ping
 
 from .alert_receiver import Receiver, until
 

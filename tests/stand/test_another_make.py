@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foundation.clock import VirtualClock
-from foundation.documents import parse_document
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.config.stand_config import StandConfig, packaged
+from thermostand.foundation.clock import VirtualClock
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.stand_config import StandConfig, packaged
 
 CAMERA_FILE = '''
 """A camera that always sees the same."""
@@ -21,8 +21,8 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.settings import CameraSettings, Identity
-from foundation.readings import Frame, bad_reading
+from thermostand.drivers.settings import CameraSettings, Identity
+from thermostand.foundation.readings import Frame, bad_reading
 
 
 class Settings(CameraSettings):
@@ -53,14 +53,14 @@ class Camera:
 USED = """
 import asyncio, sys
 from pathlib import Path
-import drivers.devices.cameras
-drivers.devices.cameras.__path__.append(sys.argv[1])
-from foundation.clock import VirtualClock
-from foundation.errors import ConfigError
-from foundation.documents import load_document
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.config.stand_config import StandConfig
+import thermostand.drivers.devices.cameras
+thermostand.drivers.devices.cameras.__path__.append(sys.argv[1])
+from thermostand.foundation.clock import VirtualClock
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.documents import load_document
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.stand_config import StandConfig
 for path in sys.argv[2:]:
     try:
         config = load_document(Path(path), StandConfig)
@@ -103,7 +103,8 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 def test_a_second_camera_protocol_is_one_file(said: dict[str, str]):
     assert said["right"] == (
-        "[('camera', 'drivers.devices.cameras.camera_gige'), ('side', 'drivers.devices.cameras.camera_still')] 9.0"
+        "[('camera', 'thermostand.drivers.devices.cameras.camera_gige'), "
+        "('side', 'thermostand.drivers.devices.cameras.camera_still')] 9.0"
     )
 
 

@@ -6,14 +6,14 @@ from contextlib import suppress
 
 import pytest
 
-from drivers.sim.physics.plant import Plant, PlantSpec
-from experiments.steps import CoolDown
-from experiments.warm_up import WarmUp
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from foundation.readings import Quality, Reading, bad_reading
-from stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.experiments.steps import CoolDown
+from thermostand.experiments.warm_up import WarmUp
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.readings import Quality, Reading, bad_reading
+from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
 
 BAND_K, TIME_CONSTANT_S = WarmUp().band_K, WarmUp().time_constant_s
 

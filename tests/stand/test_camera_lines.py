@@ -5,19 +5,19 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.wires.camera_line import frame_wire_s, packet_delay_ns
-from experiments.steps import Capture
-from foundation.clock import WallClock
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.commissioning.camera_line_check import shared_lines
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
-from stand.estimating.camera_lines import camera_lines
-from stand.estimating.estimate import price
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.wires.camera_line import frame_wire_s, packet_delay_ns
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.commissioning.camera_line_check import shared_lines
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.estimating.camera_lines import camera_lines
+from thermostand.stand.estimating.estimate import price
 
 RECIPE = """
 name: captures

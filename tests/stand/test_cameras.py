@@ -8,11 +8,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from foundation.clock import VirtualClock, WallClock, seconds_ns
-from foundation.errors import ConfigError, Unreachable
-from foundation.readings import Frame
-from stand.imaging.cameras import Cameras
-from stand.imaging.imaging import grab_together
+from thermostand.foundation.clock import VirtualClock, WallClock, seconds_ns
+from thermostand.foundation.errors import ConfigError, Unreachable
+from thermostand.foundation.readings import Frame
+from thermostand.stand.imaging.cameras import Cameras
+from thermostand.stand.imaging.imaging import grab_together
 
 
 @dataclass

@@ -4,16 +4,16 @@ import asyncio
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.errors import ConfigError, DeviceFault, GarbledReply, Occupied, StandTripped, Unreachable
-from foundation.readings import Reading
-from foundation.tasks import cancelled
-from stand.chamber.chamber import Ordered
-from stand.chamber.permits import HEATER
-from stand.fault import Fault
-from stand.gate import INTERLOCK
-from stand.interlock import Interlocked
 from tests.stand.room_devices import rooms
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import ConfigError, DeviceFault, GarbledReply, Occupied, StandTripped, Unreachable
+from thermostand.foundation.readings import Reading
+from thermostand.foundation.tasks import cancelled
+from thermostand.stand.chamber.chamber import Ordered
+from thermostand.stand.chamber.permits import HEATER
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.interlock import Interlocked
 
 
 async def test_heat_is_permitted_after_the_set_point_and_before_the_regulator_runs():

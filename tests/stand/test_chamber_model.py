@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.items import Batch, StepMark, StepState
-from foundation.readings import Reading, bad_reading
-from recording.reading.session import Session
-from stand.estimating.chamber_model import BAND_K, ChamberModel, Ramp, Response, fit, ramps_of
 from tests.recording.recorded import record
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Batch, StepMark, StepState
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.recording.reading.session import Session
+from thermostand.stand.estimating.chamber_model import BAND_K, ChamberModel, Ramp, Response, fit, ramps_of
 
 HEATING = Response(dead_s=20.0, rate_K_per_s=0.04, time_constant_s=90.0)
 COOLING = Response(dead_s=70.0, rate_K_per_s=0.012, time_constant_s=150.0)

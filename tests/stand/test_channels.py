@@ -5,15 +5,15 @@ from collections.abc import Callable
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.items import Event
-from foundation.readings import Quality, Reading
-from stand.config.chamber_section import FrozenConfig
-from stand.config.guard_section import SensorsConfig
-from stand.guarding.channels import ChannelCheck, Nature
 from tests.nightly import by_night
 from tests.stand.checked_chamber import CAMERA, CheckedChamber, Shown, good_night
 from tests.stand.guarded_chamber import CHANNELS, Action, Chamber, timed
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.stand.config.chamber_section import FrozenConfig
+from thermostand.stand.config.guard_section import SensorsConfig
+from thermostand.stand.guarding.channels import ChannelCheck, Nature
 
 AIR, GRANITE, PV, LABORATORY = (
     "thermometers.air",

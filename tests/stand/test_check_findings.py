@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.devices.imager.thermal_imager import ThermalImagerSettings
-from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
-from stand.commissioning.camera_line_check import packet_finding
-from stand.commissioning.imager import imager_finding
+from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings
+from thermostand.drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from thermostand.stand.commissioning.camera_line_check import packet_finding
+from thermostand.stand.commissioning.imager import imager_finding
 
 WARM = np.full((HEIGHT, WIDTH), 31.0)
 

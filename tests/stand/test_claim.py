@@ -17,15 +17,15 @@ from typing import Any
 import pytest
 import yaml
 
-from foundation.documents import parse_document
-from foundation.errors import InUse, SessionError
-from stand.config.stand_config import StandConfig, packaged
-from stand.running.opening import claim
-from stand.running.opening.claim import addresses, claimed
-from stand.serving import presence
 from tests import forked
 from tests.addresses import move_to_free
 from tests.sections import change
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import InUse, SessionError
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.running.opening import claim
+from thermostand.stand.running.opening.claim import addresses, claimed
+from thermostand.stand.serving import presence
 
 
 def _simulated() -> str:
@@ -191,8 +191,8 @@ async def test_a_runtime_folder_that_cannot_be_used_is_said(tmp_path: Path, monk
 HOLDER = """
 import asyncio, sys
 from pathlib import Path
-from stand.config.stand_config import load_config
-from stand.running.opening.claim import claimed
+from thermostand.stand.config.stand_config import load_config
+from thermostand.stand.running.opening.claim import claimed
 
 async def run():
     async with claimed(load_config(Path(sys.argv[1])), Path("/their/night")):

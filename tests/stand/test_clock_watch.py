@@ -1,10 +1,10 @@
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.events import CLOCK_STEP, HOST_SUSPENDED
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from recording.format.utc_offsets import UtcOffsets, offsets_of
-from stand.running.opening.clock_watch import ClockWatch
 from tests.host import Host
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.events import CLOCK_STEP, HOST_SUSPENDED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
+from thermostand.stand.running.opening.clock_watch import ClockWatch
 
 
 class Watched:

@@ -14,13 +14,13 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from compensation.cli import app as compensate
-from foundation.command_app import App
-from foundation.errors import ConfigError
-from foundation.exit_codes import BAD_INPUT, one_line_errors
-from foundation.output import output, say, show
-from foundation.version import installed_version
-from stand.commands.command_table import app as stand
+from thermostand.compensation.cli import app as compensate
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.exit_codes import BAD_INPUT, one_line_errors
+from thermostand.foundation.output import output, say, show
+from thermostand.foundation.version import installed_version
+from thermostand.stand.commands.command_table import app as stand
 
 PROGRAMS = {"stand": stand, "compensate": compensate}
 
@@ -94,7 +94,7 @@ def test_an_error_is_a_line_and_with_v_says_where_it_came_from():
     ],
 )
 def test_the_shell_completes_commands_and_options(program: str, words: str, found: str):
-    module = {"stand": "stand.cli", "compensate": "compensation.cli"}[program]
+    module = {"stand": "thermostand.stand.cli", "compensate": "thermostand.compensation.cli"}[program]
     code = f"import sys; sys.argv[0] = {program!r}; from {module} import app; app()"
     environment = {
         **os.environ,

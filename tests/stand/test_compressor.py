@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.clock import Boot, seconds_ns
-from foundation.sealed import seal
-from stand.chamber.compressor import CompressorState, decide, keep, restored
-from stand.config.stand_config import CompressorConfig
+from thermostand.foundation.clock import Boot, seconds_ns
+from thermostand.foundation.sealed import seal
+from thermostand.stand.chamber.compressor import CompressorState, decide, keep, restored
+from thermostand.stand.config.stand_config import CompressorConfig
 
 LIMITS = CompressorConfig(
     min_off_s=300, min_on_s=180, max_starts_per_h=6, start_above_cool_percent=20, stop_above_heat_percent=60
@@ -121,7 +121,7 @@ def test_writers_at_once_do_not_meet_and_the_latest_call_stays(tmp_path: Path, m
             assert goes_on.wait(60)
         sync(fd)
 
-    monkeypatch.setattr("stand.chamber.compressor.os.fsync", hanging)
+    monkeypatch.setattr("thermostand.stand.chamber.compressor.os.fsync", hanging)
     first = threading.Thread(target=keep, args=(path, CompressorState(True, NOW_NS - 2), BOOT))
     first.start()
     assert hangs.wait(60)

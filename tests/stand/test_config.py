@@ -4,15 +4,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foundation.clock import WallClock
-from foundation.documents import load_document
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.config.recipe import Recipe
-from stand.config.safe_ranges import largest_correction_K
-from stand.config.stand_config import load_config, packaged
 from tests.nightly import by_night
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.documents import load_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.safe_ranges import largest_correction_K
+from thermostand.stand.config.stand_config import load_config, packaged
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LABORATORY = yaml.safe_load((CONFIGS / "laboratory.yaml").read_text())
@@ -119,7 +119,7 @@ def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
             {"control": "tcp:localhost:1", "start": "1999-12-31T00:00:00Z"},
             "simulation.start: expected a time of the years 2000 to 2099",
         ),
-        ("flap.backend", "drivers.sim.usb", "backend and backend_address go together"),
+        ("flap.backend", "thermostand.drivers.sim.usb", "backend and backend_address go together"),
     ],
 )
 def test_a_wrong_entry_names_file_and_path(tmp_path: Path, path: str, value: object, sentence: str):

@@ -11,21 +11,21 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from foundation.clock import NS_PER_S
-from foundation.items import Event
-from stand.commands.control_cli import app, status_lines
-from stand.config.stand_config import packaged
-from stand.estimating.run_estimate import Night
-from stand.gate import Gate
-from stand.running.memory.state import RunState
-from stand.running.opening.stop import Stop
-from stand.running.status import StatusBoard
-from stand.serving.api.access import user_name
-from stand.serving.desk import FaultState, RunStatus
-from stand.serving.not_confirmed import NotConfirmed
 from tests.asking import ask
 from tests.host import Host
 from tests.stand.a_desk import ADesk, served
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Event
+from thermostand.stand.commands.control_cli import app, status_lines
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.gate import Gate
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.running.status import StatusBoard
+from thermostand.stand.serving.api.access import user_name
+from thermostand.stand.serving.desk import FaultState, RunStatus
+from thermostand.stand.serving.not_confirmed import NotConfirmed
 
 runner = CliRunner()
 

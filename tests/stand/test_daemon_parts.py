@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.hub import Hub
-from foundation.items import Batch, Event
-from foundation.patience import Patience
-from foundation.readings import Reading, bad_reading
-from stand.daemon import systemd
-from stand.daemon.counters import Counters
-from stand.daemon.daemon_file import Kept, KeptFile, kept_in
-from stand.daemon.reports import Reports
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.daemon import systemd
+from thermostand.stand.daemon.counters import Counters
+from thermostand.stand.daemon.daemon_file import Kept, KeptFile, kept_in
+from thermostand.stand.daemon.reports import Reports
 
 
 def read(hub: Hub, time_s: float, **values: float) -> None:

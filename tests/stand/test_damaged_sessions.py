@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from recording.reading.session import Session
-from stand.commands.sessions.session_commands import app
 from tests.recording.runs import SECONDS, ended, entries, half_done, record_run, remove, write_journal
+from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.sessions.session_commands import app
 
 runner = CliRunner()
 USES = [("export", "--out"), ("trim", "--out"), ("replay", "--record")]

@@ -9,19 +9,19 @@ from typing import cast
 
 import pytest
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.errors import SessionError
-from foundation.events import RUN_END
-from foundation.hub import Hub
-from foundation.items import Batch, Event
-from foundation.patience import Patience
-from foundation.readings import Reading
-from recording.reading.notes import NOTES_NAME, add_tags
-from recording.reading.session import Session
-from recording.repair.verify import verify
-from stand.assembly import Assembly
-from stand.config.stand_config import load_config, packaged
-from stand.daemon.day_record import DayRecord, remove_idle_logs
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import RUN_END
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.readings import Reading
+from thermostand.recording.reading.notes import NOTES_NAME, add_tags
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.verify import verify
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.daemon.day_record import DayRecord, remove_idle_logs
 
 CONFIG = packaged("", "simulated")
 

@@ -10,20 +10,30 @@ from typing import Any
 
 import pytest
 
-from experiments.known import Enough, Undecided, Visit, after_decision, fixed_visits
-from experiments.parameters import Known
-from experiments.steps import Capture, Decide, PlannedStep, Role, SetTemperature, Soak, Step, number_steps, usual_s
-from experiments.thermal_cycle import ThermalCycle, thermal_cycle
-from foundation.clock import NS_PER_S, WallClock
-from foundation.items import Event
-from foundation.readings import Frame
-from stand.running.executing.deciding import Decider
-from stand.running.memory.entries import Edited
-from stand.running.memory.fold import fold
-from stand.running.memory.journal import JOURNAL_NAME
 from tests.journals import read_lines
 from tests.stand.decisions_process import ANSWERS, ASKED
 from tests.stand.small_stand import Life
+from thermostand.experiments.known import Enough, Undecided, Visit, after_decision, fixed_visits
+from thermostand.experiments.parameters import Known
+from thermostand.experiments.steps import (
+    Capture,
+    Decide,
+    PlannedStep,
+    Role,
+    SetTemperature,
+    Soak,
+    Step,
+    number_steps,
+    usual_s,
+)
+from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Frame
+from thermostand.stand.running.executing.deciding import Decider
+from thermostand.stand.running.memory.entries import Edited
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
 
 CYCLE = ThermalCycle(
     equilibrium_s=100.0,

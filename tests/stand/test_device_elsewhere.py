@@ -5,8 +5,8 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from stand.commands.order_cli import app as order_app
 from tests.stand.a_desk import ADesk, served
+from thermostand.stand.commands.order_cli import app as order_app
 
 
 async def test_devices_by_hand_name_the_daemon_that_runs_elsewhere(tmp_path: Path):

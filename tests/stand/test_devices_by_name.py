@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 import yaml
 
-from foundation.clock import VirtualClock
-from foundation.documents import load_document, parse_document
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
-from stand.estimating.estimate import price
+from thermostand.foundation.clock import VirtualClock
+from thermostand.foundation.documents import load_document, parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.estimating.estimate import price
 
 
 def changed(change: Callable[[dict[str, Any]], object]) -> StandConfig:

@@ -6,19 +6,19 @@ from pathlib import Path
 import pytest
 import yaml
 
-from experiments.steps import SetTemperature, Soak, StartChamber, number_steps
-from foundation.clock import seconds_ns
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Reading, bad_reading
-from stand.config.dew import DewConfig, dew_point_degC
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.estimate import price, way_back_s
-from stand.estimating.learned import Learned
-from stand.fault import Fault
-from stand.guarding.rules import Announcements, watches
-from stand.running.order import load_order
+from thermostand.experiments.steps import SetTemperature, Soak, StartChamber, number_steps
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.config.dew import DewConfig, dew_point_degC
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.estimating.estimate import price, way_back_s
+from thermostand.stand.estimating.learned import Learned
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.running.order import load_order
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,12 @@ from time import process_time
 
 import pytest
 
-from foundation.document_faults import path_text
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
-from stand.running.order import load_order, parse_order
+from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.running.order import load_order, parse_order
 
 STAND = packaged("", "laboratory").read_text(encoding="utf-8")
 
@@ -105,7 +105,7 @@ def test_no_installed_file_has_a_number_to_another_base(path: Path):
 
 
 def parse_any(text: str) -> None:
-    from foundation.documents import yaml_data
+    from thermostand.foundation.documents import yaml_data
 
     yaml_data(text, "installed.yaml")
 

@@ -3,11 +3,11 @@
 import random
 from collections.abc import Callable
 
-from foundation.clock import seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Reading, bad_reading
-from stand.guarding.drifting import drifting
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.guarding.drifting import drifting
 
 AIR, OTHER, SP, FLAP = "thermometers.air", "thermometers.ceiling", "regulator.sp", "flap.position"
 STEP_S = 30.0

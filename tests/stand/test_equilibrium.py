@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-from drivers.settings import EquilibriumSettings
-from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
-from foundation.events import CAMERA_EQUILIBRIUM_LOST
-from foundation.hub import Hub
-from foundation.items import Batch, Event
-from foundation.readings import Reading, bad_reading
-from stand.imaging.camera_cooling import CameraTemperature
-from stand.imaging.equilibrium import CameraEquilibrium
-from stand.running.executing.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
-from stand.running.executing.settling_watch import SettlingWatch
+from thermostand.drivers.settings import EquilibriumSettings
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.events import CAMERA_EQUILIBRIUM_LOST
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.imaging.camera_cooling import CameraTemperature
+from thermostand.stand.imaging.equilibrium import CameraEquilibrium
+from thermostand.stand.running.executing.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
+from thermostand.stand.running.executing.settling_watch import SettlingWatch
 
 TIME_CONSTANT_S, RISE_K = 900.0, 20.0
 

@@ -5,8 +5,9 @@ import math
 
 import pytest
 
-from drivers.devices.motion.stage_profiles import PROFILES
-from experiments.steps import (
+from tests.stand.priced_plans import BEGIN_NS, CAPTURE, marks, planned
+from thermostand.drivers.devices.motion.stage_profiles import PROFILES
+from thermostand.experiments.steps import (
     CheckHome,
     CloseFlap,
     CoolDown,
@@ -21,16 +22,15 @@ from experiments.steps import (
     Step,
     StopChamber,
 )
-from foundation.clock import NS_PER_S
-from foundation.errors import ConfigError
-from foundation.items import Event
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.estimating.chamber_model import ChamberModel, Response
-from stand.estimating.durations import ConfiguredStand, expect, move_s
-from stand.estimating.estimate import price, way_back_s
-from stand.estimating.eta import Eta
-from stand.estimating.learned import Learned
-from tests.stand.priced_plans import BEGIN_NS, CAPTURE, marks, planned
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.items import Event
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.estimating.chamber_model import ChamberModel, Response
+from thermostand.stand.estimating.durations import ConfiguredStand, expect, move_s
+from thermostand.stand.estimating.estimate import price, way_back_s
+from thermostand.stand.estimating.eta import Eta
+from thermostand.stand.estimating.learned import Learned
 
 RESPONSE = Response(dead_s=0.0, rate_K_per_s=0.05, time_constant_s=100.0)
 CHAMBER = ChamberModel(

@@ -1,10 +1,10 @@
 """The end of a run that moves is reported, each time by another tenth of the whole."""
 
-from foundation.clock import NS_PER_S
-from foundation.events import ETA_SLIPPED
-from foundation.hub import Hub
-from foundation.items import Event, StepMark, StepState
-from stand.serving.eta_slip import EtaSlip
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import ETA_SLIPPED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.stand.serving.eta_slip import EtaSlip
 
 
 class Night:

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from experiments.steps import (
+from tests.stand.small_stand import Life
+from thermostand.experiments.steps import (
     Capture,
     CloseFlap,
     CoolDown,
@@ -20,13 +21,12 @@ from experiments.steps import (
     StopChamber,
     number_steps,
 )
-from foundation.clock import NS_PER_S
-from foundation.errors import DeviceError, Unreachable
-from foundation.items import Batch, Event, Item, StepMark
-from foundation.readings import Frame, Reading
-from stand.gate import INTERLOCK
-from stand.running.executing.camera_gap import OffsetGap
-from tests.stand.small_stand import Life
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import DeviceError, Unreachable
+from thermostand.foundation.items import Batch, Event, Item, StepMark
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.running.executing.camera_gap import OffsetGap
 
 CAPTURE = Capture(20, 5.0, 0.1, Role.FIT, 24.0)
 PLAN = tuple(

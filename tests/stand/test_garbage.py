@@ -6,9 +6,9 @@ import sys
 SEARCH = """
 import asyncio, gc, sys, time
 from pathlib import Path
-from foundation.items import Event
-from stand.serving.api.stream import EVENTS, READINGS
-from stand.serving.client import server_of
+from thermostand.foundation.items import Event
+from thermostand.stand.serving.api.stream import EVENTS, READINGS
+from thermostand.stand.serving.client import server_of
 from tests.stand.a_desk import ADesk, served
 
 async def main():

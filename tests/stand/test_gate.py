@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stand.gate import Gate, Phase, Turn, next_phase
+from thermostand.stand.gate import Gate, Phase, Turn, next_phase
 
 REASONS = st.sampled_from(["operator", "interlock", "camera_lost", "disk_low"])
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from foundation.clock import VirtualClock, WallClock, block_until, seconds_ns
-from foundation.items import Batch
-from foundation.readings import Reading
-from stand.fault import Fault
 from tests.stand.guard_bench import NOTIFIERS, Bench
+from thermostand.foundation.clock import VirtualClock, WallClock, block_until, seconds_ns
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading
+from thermostand.stand.fault import Fault
 
 
 @pytest.fixture(autouse=True)

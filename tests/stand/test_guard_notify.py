@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import WallClock
-from stand.guarding.notify_process import run_command
 from tests.stand.guard_bench import NOTIFIERS, Bench
+from thermostand.foundation.clock import WallClock
+from thermostand.stand.guarding.notify_process import run_command
 
 
 @pytest.fixture(autouse=True)

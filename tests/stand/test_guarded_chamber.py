@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable
 import pytest
 import yaml
 
-from foundation.documents import parse_document
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.fault import Fault
-from stand.guarding.rules import Announcements, watches
 from tests.nightly import by_night
 from tests.stand.guarded_chamber import Action, Chamber, timed
 from tests.stand.guarded_failures import FAILURES, HARMLESS, PHASES, Night, Outcome, table
 from tests.stand.guarded_recipes import RECIPES, Player
+from thermostand.foundation.documents import parse_document
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.rules import Announcements, watches
 
 CONFIG = load_config(packaged("", "simulated"))
 LIMIT_DEGC = CONFIG.guard.max_air_degC + 3.0

@@ -46,13 +46,15 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def ask():
-    with commands("stand.commands.sessions.session_cli") as asking:
+    with commands("thermostand.stand.commands.sessions.session_cli") as asking:
         yield asking
 
 
 @pytest.fixture(scope="module")
 def ask_all():
-    with commands("stand.commands.sessions.session_cli", "compensation.commands.fit_cli") as asking:
+    with commands(
+        "thermostand.stand.commands.sessions.session_cli", "thermostand.compensation.commands.fit_cli"
+    ) as asking:
         yield asking
 
 

@@ -5,15 +5,15 @@ from typing import Any, cast
 
 import pytest
 
-from drivers.devices.relays import CAMERA_POWER
-from foundation.clock import NS_PER_S
-from foundation.errors import StandTripped, Unreachable
-from foundation.readings import Frame
-from stand.fault import Fault
-from stand.gate import CAMERA_LOST, INTERLOCK
-from stand.imaging.camera_opening import LOST_LIMIT_S
-from stand.interlock import Interlocked
 from tests.stand.room_devices import Camera, Rooms, rooms
+from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import StandTripped, Unreachable
+from thermostand.foundation.readings import Frame
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import CAMERA_LOST, INTERLOCK
+from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S
+from thermostand.stand.interlock import Interlocked
 
 HELD, ON, OFF = (f"relays {CAMERA_POWER} {how}" for how in ("held", "on", "off"))
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from drivers.wires.discovery import FoundCamera, SerialPort, UsbDevice
-from stand.commands import init_cli
-from stand.config.stand_config import StandConfig
-from stand.running.order import load_order
+from thermostand.drivers.wires.discovery import FoundCamera, SerialPort, UsbDevice
+from thermostand.stand.commands import init_cli
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.order import load_order
 
 FILES = {"stand.yaml", "recipe.yaml", "target.yaml", "README.md"}
 

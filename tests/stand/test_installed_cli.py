@@ -6,9 +6,9 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from compensation.cli import app as compensate
-from stand.commands.command_table import app as stand
-from stand.config.stand_config import packaged
+from thermostand.compensation.cli import app as compensate
+from thermostand.stand.commands.command_table import app as stand
+from thermostand.stand.config.stand_config import packaged
 
 
 def ask(app, *words: str) -> str:

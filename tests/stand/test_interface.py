@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from stand.serving.api.listening import MOST_CLIENTS
-from stand.serving.client import running_sessions
-from stand.serving.desk import RunStatus
-from stand.serving.presence import address_in, living, opened_folder
 from tests.asking import ask, ask_status
 from tests.stand.a_desk import ADesk, served
 from tests.stand.interface_client import entries_of, obeys
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.serving.api.listening import MOST_CLIENTS
+from thermostand.stand.serving.client import running_sessions
+from thermostand.stand.serving.desk import RunStatus
+from thermostand.stand.serving.presence import address_in, living, opened_folder
 
 STATUS = RunStatus(
     recipe="thermal-cycle",

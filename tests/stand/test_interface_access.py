@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 from websockets.asyncio.client import connect
 
-from foundation.errors import ConfigError
-from stand.config.interface_section import TokenFile
-from stand.serving.api import access
-from stand.serving.api.access import (
+from tests.stand.a_desk import ADesk, served
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.interface_section import TokenFile
+from thermostand.stand.serving.api import access
+from thermostand.stand.serving.api.access import (
     BODY_LIMIT_BYTES,
     CHECK_PATH,
     COOKIE,
@@ -24,10 +25,9 @@ from stand.serving.api.access import (
     Access,
     is_open,
 )
-from stand.serving.api.doors import Interface, OtherDoor
-from stand.serving.api.token_book import TokenBook
-from stand.serving.client import server_at
-from tests.stand.a_desk import ADesk, served
+from thermostand.stand.serving.api.doors import Interface, OtherDoor
+from thermostand.stand.serving.api.token_book import TokenBook
+from thermostand.stand.serving.client import server_at
 
 TOKEN, LOOKS = "correct-horse-battery-staple", "only-looks-and-stops-for-wall"
 CHANGES_NOTHING = (STOP_PATH, CHECK_PATH, INVITE_PATH)

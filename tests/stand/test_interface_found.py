@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from stand.serving import presence as runtime
-from stand.serving.client import running_sessions, server_of
-from stand.serving.presence import Entry, Presence
 from tests import forked
 from tests.asking import ask, ask_status
 from tests.stand.a_desk import STAND, ADesk, served
 from tests.stand.interface_client import DAEMON, entries_of, obeys
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.serving import presence as runtime
+from thermostand.stand.serving.client import running_sessions, server_of
+from thermostand.stand.serving.presence import Entry, Presence
 
 
 async def folder_stated(session: Path) -> None:

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from stand.serving.api.doors import Interface
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import ask, free_port
+from thermostand.stand.serving.api.doors import Interface
 
 _QUICK, _LONG = 8, 400  # examples of each operation
 _REFUSED_UNREAD = 400

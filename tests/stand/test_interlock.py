@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from foundation.errors import StandTripped
-from stand.fault import Fault
-from stand.gate import INTERLOCK, OPERATOR, STOPPING, Gate
-from stand.interlock import Interlock, Interlocked, Motions
+from thermostand.foundation.errors import StandTripped
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import INTERLOCK, OPERATOR, STOPPING, Gate
+from thermostand.stand.interlock import Interlock, Interlocked, Motions
 
 
 class Counted:

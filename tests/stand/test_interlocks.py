@@ -3,12 +3,12 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Cause, Quality, Reading, bad_reading
-from stand.fault import Fault
-from stand.guarding.interlocks import (
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Cause, Quality, Reading, bad_reading
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.interlocks import (
     Rule,
     Watch,
     camera_temperature_bad,

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.clock import WallClock
-from foundation.errors import SessionError
-from recording.reading.journal_lines import journal_lines, lines_of
-from stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, decoded
-from stand.running.memory.journal import JOURNAL_NAME, Journal, taken_over
 from tests.journals import MARK, lines_with, read_lines
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.journal_lines import journal_lines, lines_of
+from thermostand.stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, decoded
+from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, taken_over
 
 ENTRIES = [
     Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),

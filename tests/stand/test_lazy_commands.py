@@ -10,9 +10,9 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from compensation.cli import app as compensate
-from foundation.usage import Lazy, lazy_app
-from stand.commands.command_table import app as stand
+from thermostand.compensation.cli import app as compensate
+from thermostand.foundation.usage import Lazy, lazy_app
+from thermostand.stand.commands.command_table import app as stand
 
 APPS = {"stand": stand, "compensate": compensate}
 EACH = [(name, command) for name, app in APPS.items() for command in get_command(app).commands]
@@ -36,7 +36,7 @@ def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):
     (tmp_path / "slow.py").write_text(
         "import signal\nprint('importing', flush=True)\nwhile True:\n    signal.pause()\n"
     )
-    code = "from foundation.usage import *; lazy_app('x', {'go': Lazy('slow', 'go')})(['go'])"
+    code = "from thermostand.foundation.usage import *; lazy_app('x', {'go': Lazy('slow', 'go')})(['go'])"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment

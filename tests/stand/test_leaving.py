@@ -10,23 +10,23 @@ from typing import Any, cast
 
 import pytest
 
-from foundation.clock import WallClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.patience import BUDGET_S, LEAST_S, Patience
-from recording.writing.disk import FILES_LINE, QUEUE_LINE, Disk, DiskCalls
-from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
-from stand.chamber.compressor import CompressorState
-from stand.chamber.compressor_file import CompressorFile
-from stand.daemon.daemon_file import Kept, KeptFile
-from stand.queueing.queue import append
-from stand.queueing.queue_file import Entry
-from stand.queueing.queue_work import Notes, drain
-from stand.running.memory.entries import Begun, Ended
-from stand.running.memory.journal import Journal, Logbook
-from stand.running.memory.state import RunState
-from stand.running.opening.stop import STOPPED, Interrupted, Stop
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.patience import BUDGET_S, LEAST_S, Patience
+from thermostand.recording.writing.disk import FILES_LINE, QUEUE_LINE, Disk, DiskCalls
+from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
+from thermostand.stand.chamber.compressor import CompressorState
+from thermostand.stand.chamber.compressor_file import CompressorFile
+from thermostand.stand.daemon.daemon_file import Kept, KeptFile
+from thermostand.stand.queueing.queue import append
+from thermostand.stand.queueing.queue_file import Entry
+from thermostand.stand.queueing.queue_work import Notes, drain
+from thermostand.stand.running.memory.entries import Begun, Ended
+from thermostand.stand.running.memory.journal import Journal, Logbook
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.opening.stop import STOPPED, Interrupted, Stop
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", stop_frames_below_bytes=0, alert_below_fraction=0.0)

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from stand.serving.api.listening import MOST_CLIENTS
-from stand.serving.api.pace import Pace
-from stand.serving.client import server_at, server_of
-from stand.serving.presence import address_in, living, opened_folder
 from tests.asking import ask
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import free_port
+from thermostand.stand.serving.api.listening import MOST_CLIENTS
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.client import server_at, server_of
+from thermostand.stand.serving.presence import address_in, living, opened_folder
 
 STATE = b"GET /api/v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
 LOOKS, PERIOD_S = 60, 0.02
@@ -150,8 +150,8 @@ async def test_a_client_that_asks_and_never_reads_is_not_waited_for(tmp_path: Pa
 DAEMON = """
 import asyncio, os, resource, sys
 from pathlib import Path
-from stand.serving.api.doors import Interface
-from stand.serving.desk import Done
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.desk import Done
 from tests.stand.a_desk import ADesk, served
 
 class Desk(ADesk):

@@ -6,12 +6,12 @@ import time
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Reading, bad_reading
-from stand.serving.live_history import MOST_CHANNELS, MOST_MARKS, History
-from stand.serving.recorded_history import recorded_week, session_columns
 from tests.recording.recorded import START_NS, half_second, record
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.serving.live_history import MOST_CHANNELS, MOST_MARKS, History
+from thermostand.stand.serving.recorded_history import recorded_week, session_columns
 
 DAY_S = 24 * 3600
 T0 = 1_767_290_400 * NS_PER_S  # a whole number of cells

@@ -4,9 +4,9 @@ import time
 
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.instants import date_time, local_text, parse_instant, utc_text
-from recording.format.utc_offsets import UtcOffsets
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.instants import date_time, local_text, parse_instant, utc_text
+from thermostand.recording.format.utc_offsets import UtcOffsets
 
 WINTER_NS = 1_767_290_404 * NS_PER_S  # 2026-01-01T18:00:04Z
 SUMMER_NS = 1_782_928_804 * NS_PER_S  # 2026-07-01T18:00:04Z

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable
 
-from foundation.clock import seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Reading, bad_reading
-from stand.config.chamber_section import (
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.config.chamber_section import (
     CameraFeelsConfig,
     ChamberConfig,
     FirstHeatConfig,
@@ -15,12 +15,12 @@ from stand.config.chamber_section import (
     HeatFeltConfig,
     NeededOutputConfig,
 )
-from stand.guarding.felt_air import camera_feels, granite_feels
-from stand.guarding.first_heat import first_heat
-from stand.guarding.frozen import frozen
-from stand.guarding.heat_given import heat_not_felt, too_much_heat
-from stand.guarding.interlocks import Rule
-from stand.guarding.needed_output import output_not_as_needed
+from thermostand.stand.guarding.felt_air import camera_feels, granite_feels
+from thermostand.stand.guarding.first_heat import first_heat
+from thermostand.stand.guarding.frozen import frozen
+from thermostand.stand.guarding.heat_given import heat_not_felt, too_much_heat
+from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.guarding.needed_output import output_not_as_needed
 
 POLL_S = 5
 PV, AIR, GRANITE, CAMERA = "regulator.pv", "thermometers.air", "thermometers.granite_inside", "camera.temperature"

@@ -2,7 +2,8 @@
 
 import pytest
 
-from foundation.errors import (
+from tests.stand.guard_bench import NOTIFIERS, Bench
+from thermostand.foundation.errors import (
     DeviceAlarm,
     DeviceError,
     DeviceFault,
@@ -12,10 +13,9 @@ from foundation.errors import (
     Superseded,
     Unreachable,
 )
-from foundation.items import Batch
-from foundation.readings import Reading, bad_reading
-from stand.guarding.met_errors import MetErrors
-from tests.stand.guard_bench import NOTIFIERS, Bench
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.guarding.met_errors import MetErrors
 
 KINDS = {"flap": "flap", "linear": "axis", "regulator": "regulator", "relays": "relays", "camera": "camera"}
 TABLE = [

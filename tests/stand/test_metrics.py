@@ -5,11 +5,11 @@ import json
 import re
 from pathlib import Path
 
-from stand.serving.api.bridge import Bridge, Snapshot
-from stand.serving.api.metrics import metrics
-from stand.serving.desk import FaultState, HeatByHand, QueuedRun
 from tests.stand.a_desk import ADesk
 from tests.stand.test_interface import STATUS
+from thermostand.stand.serving.api.bridge import Bridge, Snapshot
+from thermostand.stand.serving.api.metrics import metrics
+from thermostand.stand.serving.desk import FaultState, HeatByHand, QueuedRun
 
 _SAMPLE = re.compile(r'(thermostand_[a-z_]+)(\{([a-z_]+="(\\.|[^"\\\n])*",?)*\})? (-?[0-9.e+-]+)')
 
@@ -56,7 +56,7 @@ async def test_every_line_is_of_the_format_and_no_measurement_is_invented():
 
 async def test_the_dashboard_asks_for_metrics_that_there_are():
     text = await page()
-    dashboard = json.loads(Path(str(importlib.resources.files("configs") / "grafana.json")).read_text())
+    dashboard = json.loads(Path(str(importlib.resources.files("thermostand.configs") / "grafana.json")).read_text())
     asked = {
         name
         for panel in dashboard["panels"]

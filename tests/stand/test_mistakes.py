@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from compensation.drift.model_file import load_model
-from foundation.documents import load_document, parse_document
-from foundation.errors import ConfigError, SessionError, StandError
-from recording.reading.session import Session
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
-from stand.running.memory.journal import Journal
-from stand.running.order import load_order
+from thermostand.compensation.drift.model_file import load_model
+from thermostand.foundation.documents import load_document, parse_document
+from thermostand.foundation.errors import ConfigError, SessionError, StandError
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.running.memory.journal import Journal
+from thermostand.stand.running.order import load_order
 
 STAND = packaged("", "laboratory").read_text(encoding="utf-8")
 RECIPE = packaged("recipes", "trial").read_text(encoding="utf-8")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from typer.testing import CliRunner, Result
 
-from stand.commands.command_table import app as stand
-from stand.commands.order_cli import app
-from stand.serving.api.doors import Interface
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import book, free_port
+from thermostand.stand.commands.command_table import app as stand
+from thermostand.stand.commands.order_cli import app
+from thermostand.stand.serving.api.doors import Interface
 
 TOKEN = "correct-horse-battery-staple"
 

@@ -8,15 +8,15 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from axe_playwright_python.base import AXE_SCRIPT
 
-from foundation.clock import NS_PER_S
-from foundation.items import Batch, StepMark, StepState
-from foundation.readings import Reading
-from stand.gate import CAMERA_LOST
-from stand.serving.desk import HeatByHand
-from stand.serving.not_confirmed import NotConfirmed
 from tests.recording.recorded import record
 from tests.stand.browser import PHONE, VIEWS, a_page, needs_chromium
 from tests.stand.page_desk import a_night, frame_of, free_port, target_image
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Batch, StepMark, StepState
+from thermostand.foundation.readings import Reading
+from thermostand.stand.gate import CAMERA_LOST
+from thermostand.stand.serving.desk import HeatByHand
+from thermostand.stand.serving.not_confirmed import NotConfirmed
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
 

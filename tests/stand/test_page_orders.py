@@ -7,13 +7,13 @@ import re
 
 import pytest
 
-from foundation.documents import parse_document
-from stand.config.recipe import Recipe
-from stand.config.stand_config import packaged
-from stand.gate import NOT_RECORDED, OPERATOR
-from stand.serving.desk import QueuedRun
-from stand.serving.not_confirmed import NotConfirmed
 from tests.stand.browser import DESKTOP, PHONE, VIEWS, a_page, needs_chromium
+from thermostand.foundation.documents import parse_document
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.gate import NOT_RECORDED, OPERATOR
+from thermostand.stand.serving.desk import QueuedRun
+from thermostand.stand.serving.not_confirmed import NotConfirmed
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
 

@@ -12,11 +12,11 @@ from contextlib import asynccontextmanager
 import pytest
 import pytest_asyncio
 
-from foundation.items import Batch, Event, StepMark, StepState
-from stand.gate import IN_WORDS
-from stand.serving.page_room import PAGE
 from tests.recording.recorded import half_second, record
 from tests.stand.page_desk import TARGET, a_night, frame_of, free_port, target_image
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.stand.gate import IN_WORDS
+from thermostand.stand.serving.page_room import PAGE
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 

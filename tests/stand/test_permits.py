@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.errors import DeviceError, DeviceFault, GarbledReply, Unreachable
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.readings import Reading
-from foundation.tasks import cancelled
-from stand.chamber.compressor import CompressorState
-from stand.chamber.keeper import Keeper
-from stand.chamber.permits import COMPRESSOR, HEATER, Permission, PermitLimits, Permits
-from stand.config.stand_config import CompressorConfig
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Unreachable
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Reading
+from thermostand.foundation.tasks import cancelled
+from thermostand.stand.chamber.compressor import CompressorState
+from thermostand.stand.chamber.keeper import Keeper
+from thermostand.stand.chamber.permits import COMPRESSOR, HEATER, Permission, PermitLimits, Permits
+from thermostand.stand.config.stand_config import CompressorConfig
 
 HOLD_S, TEST_S = 15.0, 3.0
 LIMITS = CompressorConfig(min_off_s=300.0, min_on_s=180.0, start_above_cool_percent=20.0)

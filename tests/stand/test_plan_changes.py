@@ -9,7 +9,9 @@ from typing import Any, cast
 
 import pytest
 
-from experiments.steps import (
+from tests.journals import lines_with, read_lines
+from tests.stand.small_stand import Life
+from thermostand.experiments.steps import (
     Capture,
     CheckHome,
     CloseFlap,
@@ -26,16 +28,14 @@ from experiments.steps import (
     number_steps,
     step_of,
 )
-from foundation.clock import NS_PER_S
-from foundation.errors import ConfigError
-from foundation.items import Event, StepMark, StepState
-from foundation.readings import Frame
-from stand.gate import OPERATOR
-from stand.running.memory.entries import Change, Edited, Extended, Skipped, Step, change_of, data_of
-from stand.running.memory.fold import fold, refusal
-from stand.running.memory.journal import JOURNAL_NAME
-from tests.journals import lines_with, read_lines
-from tests.stand.small_stand import Life
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.foundation.readings import Frame
+from thermostand.stand.gate import OPERATOR
+from thermostand.stand.running.memory.entries import Change, Edited, Extended, Skipped, Step, change_of, data_of
+from thermostand.stand.running.memory.fold import fold, refusal
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
 
 CAPTURE = Capture(4, 5.0, 0.1, Role.FIT, 24.0)
 PLAN = tuple(

@@ -5,24 +5,24 @@ from collections.abc import Callable
 
 import pytest
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Reading, bad_reading
-from stand.config.guard_section import HeaterOffConfig, HeatingConfig
-from stand.config.stand_config import load_config, packaged
-from stand.fault import Fault
-from stand.guarding.plausibility import (
+from tests.nightly import by_night
+from tests.stand.chamber_night import START_NS, Night
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.config.guard_section import HeaterOffConfig, HeatingConfig
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.plausibility import (
     Heating,
     heater_not_warming,
     heating,
     stuck_while_other_moves,
     warming_while_off,
 )
-from stand.guarding.rules import Announcements, watches
-from stand.guarding.surroundings import Following, measured, together
-from tests.nightly import by_night
-from tests.stand.chamber_night import START_NS, Night
+from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.guarding.surroundings import Following, measured, together
 
 LIMITS = HeatingConfig(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)
 LOOK_S = 10.0

@@ -2,12 +2,12 @@
 
 from typing import cast
 
-from drivers.devices.protocols import Sensor
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.readings import Reading
-from stand.poller import Poller
+from thermostand.drivers.devices.protocols import Sensor
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.readings import Reading
+from thermostand.stand.poller import Poller
 
 
 class Slow:

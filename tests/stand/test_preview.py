@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from markers.detection import detect
-from markers.target import load_target
-from stand.serving.preview import Previewer, half_jpeg, keystone_percent, setup_of, tilt_deg
-from stand.serving.shot import Shot
 from tests.compensation.rendered import Scene, photograph, render, true_centres_px
+from thermostand.markers.detection import detect
+from thermostand.markers.target import load_target
+from thermostand.stand.serving.preview import Previewer, half_jpeg, keystone_percent, setup_of, tilt_deg
+from thermostand.stand.serving.shot import Shot
 
 PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
 SMALL = Scene(size=(612, 512), f_px=2193)

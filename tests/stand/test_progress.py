@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from foundation.progress import late_progress
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.repair.salvage import salvage_session
-from stand.commands.sessions.session_commands import app
 from tests.recording.damage import write_segment
+from thermostand.foundation.progress import late_progress
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.stand.commands.sessions.session_commands import app
 
 
 def test_short_work_is_not_shown(capsys: pytest.CaptureFixture[str]):
@@ -25,7 +25,7 @@ def test_short_work_is_not_shown(capsys: pytest.CaptureFixture[str]):
 def test_long_work_is_shown_from_its_first_report_on_and_then_at_each_tenth(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("foundation.progress._LATE_NS", 0)
+    monkeypatch.setattr("thermostand.foundation.progress._LATE_NS", 0)
     with late_progress("salvage", 10.0) as report:
         for done in (0.01, 0.02, 1.0, 1.5, 9.0):
             report(done, "0001.mcap")
@@ -35,7 +35,7 @@ def test_long_work_is_shown_from_its_first_report_on_and_then_at_each_tenth(
 
 
 def test_a_salvage_and_a_verification_say_how_far_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("foundation.progress._LATE_NS", 0)
+    monkeypatch.setattr("thermostand.foundation.progress._LATE_NS", 0)
     write_segment(tmp_path / "s" / TELEMETRY, TELEMETRY, range(3), finish=True)
     write_segment(tmp_path / "s" / FRAMES, FRAMES, range(3))
     for command in ("salvage", "verify"):

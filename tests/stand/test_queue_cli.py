@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner, Result
 
-from stand.commands.queue_cli import app
-from stand.queueing import queue
-from stand.queueing.queue_file import QUEUE_NAME, State, working
 from tests.stand.a_desk import ADesk, served
+from thermostand.stand.commands.queue_cli import app
+from thermostand.stand.queueing import queue
+from thermostand.stand.queueing.queue_file import QUEUE_NAME, State, working
 
 runner = CliRunner()
 
@@ -135,7 +135,9 @@ async def test_a_queue_that_a_daemon_has_is_reached_through_it(tmp_path: Path):
 
 
 def test_a_night_that_the_disk_has_no_room_for_is_not_queued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("stand.estimating.run_estimate.shutil.disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    monkeypatch.setattr(
+        "thermostand.stand.estimating.run_estimate.shutil.disk_usage", lambda _: SimpleNamespace(free=1_000_000)
+    )
     refused = invoke(tmp_path, "add", "demo")
     assert (refused.exit_code, "GB are free" in refused.stderr) == (1, True)
     assert not (tmp_path / QUEUE_NAME).exists()

@@ -12,12 +12,12 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from foundation.errors import ConfigError, SessionError, StandTripped
-from stand.queueing import queue
-from stand.queueing.queue_file import KEPT_ENDED, LAST_NAME, QUEUE_NAME, State, changing, working
-from stand.running.order import Order, load_order
 from tests import forked
 from tests.recording.disks import limit_files
+from thermostand.foundation.errors import ConfigError, SessionError, StandTripped
+from thermostand.stand.queueing import queue
+from thermostand.stand.queueing.queue_file import KEPT_ENDED, LAST_NAME, QUEUE_NAME, State, changing, working
+from thermostand.stand.running.order import Order, load_order
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -241,8 +241,8 @@ def test_a_number_that_is_not_there_is_said_to(tmp_path: Path, number: int):
 ADDING = """
 import sys
 from pathlib import Path
-from stand.queueing import queue
-from stand.running.order import load_order
+from thermostand.stand.queueing import queue
+from thermostand.stand.running.order import load_order
 order = load_order("warm-up", "simulated")
 print("ready", flush=True)
 sys.stdin.readline()

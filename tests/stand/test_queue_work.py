@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import FollowedClock
-from foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Unreachable
-from stand.queueing import queue
-from stand.queueing.queue_file import Entry, working
-from stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped, work
-from stand.running.opening.stop import Interrupted
-from stand.running.order import load_order
 from tests import forked
+from thermostand.foundation.clock import FollowedClock
+from thermostand.foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Unreachable
+from thermostand.stand.queueing import queue
+from thermostand.stand.queueing.queue_file import Entry, working
+from thermostand.stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped, work
+from thermostand.stand.running.opening.stop import Interrupted
+from thermostand.stand.running.order import load_order
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -161,7 +161,7 @@ async def test_a_queue_that_cannot_be_reached_keeps_nobody_from_leaving(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Its lock stands for a disk that hangs."""
-    monkeypatch.setattr("stand.queueing.queue_work._NOTED_WITHIN_S", 0.1)
+    monkeypatch.setattr("thermostand.stand.queueing.queue_work._NOTED_WITHIN_S", 0.1)
     runs = Runs(tmp_path, None)
     with (tmp_path / ".queue.lock").open("w") as lock:
 

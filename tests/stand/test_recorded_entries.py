@@ -7,16 +7,18 @@ from typing import Any
 
 import pytest
 
-from foundation.clock import VirtualClock, WallClock
-from foundation.errors import SessionError
-from foundation.events import PLAN_CHANGED
-from foundation.hub import Hub
-from foundation.items import Event, StepMark, StepState
-from foundation.patience import Patience
-from recording.format.restarts import restarted
-from stand.fault import Fault
-from stand.gate import INTERLOCK, OPERATOR, STOPPING
-from stand.running.memory.entries import (
+from tests.journals import read_lines
+from tests.stand.test_run_table import CAPTURE, ID, PLAN, WARM
+from thermostand.foundation.clock import VirtualClock, WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import PLAN_CHANGED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.foundation.patience import Patience
+from thermostand.recording.format.restarts import restarted
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import INTERLOCK, OPERATOR, STOPPING
+from thermostand.stand.running.memory.entries import (
     Again,
     Begun,
     Cleared,
@@ -29,11 +31,9 @@ from stand.running.memory.entries import (
     Tripped,
     data_of,
 )
-from stand.running.memory.fold import fold
-from stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
-from stand.running.resume import Interruption, with_recorded
-from tests.journals import read_lines
-from tests.stand.test_run_table import CAPTURE, ID, PLAN, WARM
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
+from thermostand.stand.running.resume import Interruption, with_recorded
 
 BEGUN = Begun(1, "night-1", "0f", {})
 

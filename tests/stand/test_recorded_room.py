@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from stand.serving.api import recorded
-from stand.serving.api.bridge import NoAnswer
-from stand.serving.api.doors import Interface
-from stand.serving.api.recorded import REPORT, REPORT_CSP, Disk
 from tests.recording.recorded import record
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import ask, free_port
+from thermostand.stand.serving.api import recorded
+from thermostand.stand.serving.api.bridge import NoAnswer
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.recorded import REPORT, REPORT_CSP, Disk
 
 
 async def test_a_disk_that_hangs_keeps_neither_the_interface_nor_the_process(monkeypatch: pytest.MonkeyPatch):

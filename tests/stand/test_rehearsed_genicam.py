@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from foundation.errors import ConfigError
-from stand.commands.command_table import app
-from stand.commissioning.genicam_rehearsal import rehearse
-from stand.config.stand_config import load_config, packaged
 from tests.dialects import DIALECTS
 from tests.system.conftest import require_aravis
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.commissioning.genicam_rehearsal import rehearse
+from thermostand.stand.config.stand_config import load_config, packaged
 
 
 async def test_a_file_tells_which_features_would_be_used(tmp_path: Path):

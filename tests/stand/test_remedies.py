@@ -8,17 +8,17 @@ from string import Formatter
 
 import pytest
 
-import stand
-from foundation import events
-from foundation.clock import NS_PER_S
-from foundation.events import GUARD, KINDS, Alert, EventKind, alert_of, event, guard_rule
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.repeats import RepeatLimit
-from stand import gate
-from stand.serving.alert_book import AlertBook
-from stand.watching.remedies import next_command, troubleshooting
-from stand.watching.there import event_line
+from thermostand import stand
+from thermostand.foundation import events
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import GUARD, KINDS, Alert, EventKind, alert_of, event, guard_rule
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.repeats import RepeatLimit
+from thermostand.stand import gate
+from thermostand.stand.serving.alert_book import AlertBook
+from thermostand.stand.watching.remedies import next_command, troubleshooting
+from thermostand.stand.watching.there import event_line
 
 ROOT = Path(stand.__file__).parents[1]
 GENERIC = next_command("of a later version", {})
@@ -123,7 +123,7 @@ TREES = {
     path: ast.parse(text)
     for room in ROOMS
     for path in ([ROOT / room] if room.endswith(".py") else sorted((ROOT / room).rglob("*.py")))
-    if "foundation.events" in (text := path.read_text("utf-8")) or "Event(" in text
+    if "thermostand.foundation.events" in (text := path.read_text("utf-8")) or "Event(" in text
 }
 NAMED = {name: row for name, row in vars(events).items() if isinstance(row, EventKind)} | {
     "HELD": gate.HELD,

@@ -2,10 +2,10 @@
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.repeats import RepeatLimit
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.repeats import RepeatLimit
 
 
 def published(kind: str, every_s: float, count: int, data: dict[str, object] | None = None) -> list[Event]:

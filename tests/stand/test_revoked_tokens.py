@@ -14,18 +14,18 @@ from pathlib import Path
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
-from foundation.items import Event
-from stand.commands.reloading import Reloading
-from stand.config.interface_section import TokenFile, load_tokens, write_tokens
-from stand.serving.api.access import COOKIE, STOP_PATH
-from stand.serving.api.doors import Interface
-from stand.serving.api.token_book import TokenBook
-from stand.serving.secop.door import door_at
 from tests.addresses import free_port
 from tests.stand.a_desk import ADesk, served
 from tests.stand.secop_desk import SecopDesk
 from tests.stand.secop_talk import talking
 from tests.stand.test_interface_access import LOOKS, PROXIED, TOKEN, ask
+from thermostand.foundation.items import Event
+from thermostand.stand.commands.reloading import Reloading
+from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
+from thermostand.stand.serving.api.access import COOKIE, STOP_PATH
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.token_book import TokenBook
+from thermostand.stand.serving.secop.door import door_at
 
 OTHER = "another-token-of-rose-that-is-new"
 PAUSE = "/api/v1/run/pause"
@@ -190,8 +190,8 @@ ON_A_TERMINAL = """
 import asyncio, os, signal, sys
 os.setsid()
 terminal = os.open(sys.argv[1], os.O_RDWR)  # it is the session's from now on
-from stand.commands.reloading import Reloading
-from stand.serving.api.token_book import TokenBook
+from thermostand.stand.commands.reloading import Reloading
+from thermostand.stand.serving.api.token_book import TokenBook
 
 async def main():
     ended = asyncio.Event()

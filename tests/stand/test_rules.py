@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Reading, bad_reading
-from recording.writing.notices import SpaceWatch
-from stand.config.stand_config import load_config, packaged
-from stand.fault import Fault
-from stand.gate import OPERATOR
-from stand.guarding.rules import Announcements, natures, watches
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.recording.writing.notices import SpaceWatch
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import OPERATOR
+from thermostand.stand.guarding.rules import Announcements, natures, watches
 
 
 class Table:

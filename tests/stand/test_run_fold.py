@@ -6,10 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.steps import Soak
-from foundation.errors import ConfigError, SessionError
-from stand.running.executing.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
-from stand.running.memory.entries import (
+from tests.journals import lines_with, read_lines
+from tests.stand.test_run_table import ID, PLAN, SOAK, S
+from thermostand.experiments.steps import Soak
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.stand.running.executing.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
+from thermostand.stand.running.memory.entries import (
     Again,
     Begun,
     Cleared,
@@ -29,11 +31,9 @@ from stand.running.memory.entries import (
     Tripped,
     Written,
 )
-from stand.running.memory.fold import after, fold
-from stand.running.memory.state import RunState
-from stand.running.resume import folded
-from tests.journals import lines_with, read_lines
-from tests.stand.test_run_table import ID, PLAN, SOAK, S
+from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.running.resume import folded
 
 ids = st.sampled_from([*ID, "unknown"])
 soak = {"kind": "soak", "parameters": {"duration_s": 5.0}}

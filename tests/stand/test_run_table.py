@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     Capture,
     CheckHome,
     CloseFlap,
@@ -23,9 +23,9 @@ from experiments.steps import (
     StopChamber,
     number_steps,
 )
-from foundation.clock import NS_PER_S
-from stand.gate import INTERLOCK, OPERATOR
-from stand.running.executing.actions import (
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.gate import INTERLOCK, OPERATOR
+from thermostand.stand.running.executing.actions import (
     Aim,
     Begin,
     Complete,
@@ -45,7 +45,7 @@ from stand.running.executing.actions import (
     next_due_ns,
     worth_of_soaks,
 )
-from stand.running.memory.entries import (
+from thermostand.stand.running.memory.entries import (
     Again,
     Cleared,
     Cooled,
@@ -64,8 +64,8 @@ from stand.running.memory.entries import (
     Taken,
     Tripped,
 )
-from stand.running.memory.fold import after, fold
-from stand.running.memory.state import RunState, SetUp
+from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.memory.state import RunState, SetUp
 
 S = NS_PER_S
 FIT = Capture(2, 10.0, 0.1, Role.FIT, 30.0)

@@ -4,12 +4,12 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.errors import DeviceFault, Unreachable
-from foundation.hub import Hub
-from foundation.items import Event
-from stand.config.stand_config import load_config, packaged
-from stand.safety import TRY_LIMIT_S, Pending, Safety
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.errors import DeviceFault, Unreachable
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.safety import TRY_LIMIT_S, Pending, Safety
 
 
 class Actuator:

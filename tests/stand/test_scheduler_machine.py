@@ -13,7 +13,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from experiments.steps import (
+from tests.stand.small_stand import Life
+from thermostand.experiments.steps import (
     Capture,
     CloseFlap,
     OpenFlap,
@@ -24,18 +25,17 @@ from experiments.steps import (
     StopChamber,
     number_steps,
 )
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.errors import StandTripped
-from foundation.items import StepMark, StepState
-from foundation.readings import Frame
-from recording.reading.journal_lines import lines_of
-from stand.fault import Fault
-from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
-from stand.running.executing.actions import CREDITED_WITHIN_K
-from stand.running.memory.entries import Again, Dwell, Step, decoded
-from stand.running.memory.journal import JOURNAL_NAME
-from stand.running.opening.stop import Interrupted
-from tests.stand.small_stand import Life
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.errors import StandTripped
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.foundation.readings import Frame
+from thermostand.recording.reading.journal_lines import lines_of
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
+from thermostand.stand.running.executing.actions import CREDITED_WITHIN_K
+from thermostand.stand.running.memory.entries import Again, Dwell, Step, decoded
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
+from thermostand.stand.running.opening.stop import Interrupted
 
 FRAMES = 4
 MEMORY = Path("/dev/shm")  # a journal on a busy disk takes most of the time

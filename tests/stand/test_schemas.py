@@ -11,11 +11,11 @@ import yaml
 from jsonschema import Draft202012Validator
 from typer.testing import CliRunner
 
-from compensation.cli import app as compensate
-from compensation.commands.schema_cli import DOCUMENTS as OFFLINE
-from foundation.schemas import schema_text
-from stand.commands.command_table import app as stand
-from stand.commands.config_cli import DOCUMENTS
+from thermostand.compensation.cli import app as compensate
+from thermostand.compensation.commands.schema_cli import DOCUMENTS as OFFLINE
+from thermostand.foundation.schemas import schema_text
+from thermostand.stand.commands.command_table import app as stand
+from thermostand.stand.commands.config_cli import DOCUMENTS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FILES = sorted(CONFIGS.rglob("*.yaml"))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.sealed import seal, unseal
+from thermostand.foundation.sealed import seal, unseal
 
 WORDS = st.text('ab{}\n"µ', max_size=8)
 CONTENTS = st.dictionaries(WORDS, st.floats(allow_nan=False) | WORDS | st.none(), min_size=1, max_size=4)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from stand.gate import INTERLOCK
-from stand.serving.desk import FaultState, HeatByHand
-from stand.serving.secop.secop_lines import Request, message, parsed
 from tests.stand.secop_desk import JAM, NO, WIRE, SecopDesk, node
 from tests.stand.secop_talk import talking
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.serving.desk import FaultState, HeatByHand
+from thermostand.stand.serving.secop.secop_lines import Request, message, parsed
 
 
 @pytest.mark.parametrize(
@@ -249,6 +249,6 @@ async def test_a_run_and_a_trip_refuse_orders_with_classes_of_their_own(tmp_path
 
 
 async def test_a_control_loop_that_hangs_is_an_error_and_no_old_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("stand.serving.secop.node._OLD_S", -1.0)
+    monkeypatch.setattr("thermostand.stand.serving.secop.node._OLD_S", -1.0)
     async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("read chamber"))[2][0] == "CommunicationFailed"

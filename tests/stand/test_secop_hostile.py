@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from stand.serving.secop import door
-from stand.serving.secop.secop_lines import LINE_LIMIT_BYTES
 from tests.stand.secop_desk import SecopDesk, node
 from tests.stand.secop_talk import LIMIT_S, talking
 from tests.stand.test_interface_access import EVIL, PROXIED, TOKEN
+from thermostand.stand.serving.secop import door
+from thermostand.stand.serving.secop.secop_lines import LINE_LIMIT_BYTES
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,15 @@
 
 from typing import Any, cast
 
-from drivers.devices.absent_devices import NoRelays
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.errors import Unreachable
-from foundation.instants import local_text
-from stand.config.stand_config import load_config, packaged
-from stand.serving.not_confirmed import NotConfirmed
-from stand.serving.seen import seen_state
-from stand.watching.moment import not_yet_safe
 from tests.stand.room_devices import Rooms, rooms
+from thermostand.drivers.devices.absent_devices import NoRelays
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.errors import Unreachable
+from thermostand.foundation.instants import local_text
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.serving.not_confirmed import NotConfirmed
+from thermostand.stand.serving.seen import seen_state
+from thermostand.stand.watching.moment import not_yet_safe
 
 BEGIN = f"since {local_text(0)}"
 

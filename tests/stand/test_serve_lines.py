@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.output import Output, outputting
-from stand.commands import serve_cli
-from stand.commands.command_table import app
-from stand.commands.serve_cli import _events_shown
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.output import Output, outputting
+from thermostand.stand.commands import serve_cli
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.commands.serve_cli import _events_shown
 
 LOST = Event(7, "warning", "device_lost", "linear does not answer", {"device": "linear", "lost_s": math.nan})
 

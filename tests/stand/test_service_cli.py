@@ -8,10 +8,10 @@ from pathlib import Path
 
 from typer.testing import CliRunner, Result
 
-from stand.commands.command_table import app
-from stand.config.stand_config import packaged
-from stand.running.opening.stand_latch import SYSTEM_FOLDER
-from stand.serving.presence import STANDS_FOLDER
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.running.opening.stand_latch import SYSTEM_FOLDER
+from thermostand.stand.serving.presence import STANDS_FOLDER
 
 CONFIG = packaged("", "simulated")
 
@@ -34,7 +34,7 @@ def test_the_unit_starts_the_daemon_and_gives_it_time_to_make_safe(tmp_path: Pat
     unit.optionxform = str  # pyright: ignore[reportAttributeAccessIssue] - as its documentation says
     unit.read(tmp_path / "etc/systemd/system/thermostand-simulated-stand.service")
     command = shlex.split(unit["Service"]["ExecStart"])
-    assert command[1:] == ["-m", "stand.cli", "serve", str(CONFIG.absolute()), "--port", "8080"]
+    assert command[1:] == ["-m", "thermostand.stand.cli", "serve", str(CONFIG.absolute()), "--port", "8080"]
     assert unit["Service"]["User"] == "operator"
     assert int(unit["Service"]["WatchdogSec"]) == 60
     assert unit["Service"]["ExecReload"] == "/bin/kill -HUP $MAINPID"

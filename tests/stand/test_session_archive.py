@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from stand.commands.sessions.session_commands import app
 from tests.recording.runs import killed, record_run
+from thermostand.stand.commands.sessions.session_commands import app
 
 
 @pytest.fixture(scope="module")

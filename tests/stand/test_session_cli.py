@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from foundation.items import Event
-from recording.reading.session import Session
-from stand.commands.sessions.session_table import fitting, lines
 from tests.recording.recorded import START_NS, half_second, item_key, record
 from tests.stand.session_commands import COUNT, ask, refused
+from thermostand.foundation.items import Event
+from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.sessions.session_table import fitting, lines
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from compensation.one_equilibrium import TwoEquilibria
-from compensation.reporting import report
-from stand.running.session_report import NotReported, report_session
+from thermostand.compensation.one_equilibrium import TwoEquilibria
+from thermostand.compensation.reporting import report
+from thermostand.stand.running.session_report import NotReported, report_session
 
 MOVED = "the image moved by +30 (1) mpx along I and -40 (1) along J (standard uncertainty)"
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from foundation.clock import NS_PER_S
-from foundation.events import CLOCK_STEP
-from foundation.items import Event
-from recording.reading.session import Session
-from recording.repair.verify import verify
-from stand.commands.sessions.session_commands import app
 from tests.recording.recorded import START_NS, half_second, record
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import CLOCK_STEP
+from thermostand.foundation.items import Event
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.verify import verify
+from thermostand.stand.commands.sessions.session_commands import app
 
 HOUR_NS = 3600 * NS_PER_S
 STEPPED = 9  # the half second of 12 at which the system clock was set an hour forward, after 4.5 s

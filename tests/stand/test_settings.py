@@ -12,24 +12,24 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-import drivers.devices
-import drivers.wires
-import stand.chamber
-import stand.guarding
-import stand.imaging
-import stand.table
-from drivers.devices.thermometers import ThermometerSettings
-from drivers.wires.camera_settings import GigeCameraSettings
-from foundation.clock import WallClock
-from foundation.documents import Document, parse_document
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.config.stand_config import StandConfig, packaged
+import thermostand.drivers.devices
+import thermostand.drivers.wires
+import thermostand.stand.chamber
+import thermostand.stand.guarding
+import thermostand.stand.imaging
+import thermostand.stand.table
+from thermostand.drivers.devices.thermometers import ThermometerSettings
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.documents import Document, parse_document
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.stand_config import StandConfig, packaged
 
 
 def modules_of(*packages: ModuleType) -> Iterator[ModuleType]:
     for package in packages:
-        look = pkgutil.walk_packages if package is drivers.devices else pkgutil.iter_modules
+        look = pkgutil.walk_packages if package is thermostand.drivers.devices else pkgutil.iter_modules
         for found in look(package.__path__, f"{package.__name__}."):
             yield importlib.import_module(found.name)
 
@@ -70,7 +70,9 @@ REGISTER_MAP = {
 
 
 def test_every_settings_model_of_a_driver_is_a_part_of_the_stands_file():
-    models = {each for each in classes(drivers.devices, drivers.wires) if issubclass(each, Document)}
+    models = {
+        each for each in classes(thermostand.drivers.devices, thermostand.drivers.wires) if issubclass(each, Document)
+    }
     base = {"ChamberUnitSettings", "AravisCameraSettings"}  # of those of each make or kind
     assert {each.__name__ for each in models} - {
         each.__name__ for each in models_in(StandConfig)
@@ -80,7 +82,9 @@ def test_every_settings_model_of_a_driver_is_a_part_of_the_stands_file():
 def test_a_driver_that_takes_settings_takes_none_of_their_keys_beside_them():
     keys = {name for model in models_in(StandConfig) for name in model.model_fields}
     made = [
-        inspect.signature(each) for each in classes(drivers.devices, drivers.wires) if inspect.isfunction(each.__init__)
+        inspect.signature(each)
+        for each in classes(thermostand.drivers.devices, thermostand.drivers.wires)
+        if inspect.isfunction(each.__init__)
     ]
     taking = [each.parameters for each in made if "settings" in each.parameters]
     assert len(taking) >= 6
@@ -89,7 +93,15 @@ def test_a_driver_that_takes_settings_takes_none_of_their_keys_beside_them():
 
 def test_no_dataclass_repeats_settings():
     settings = [set(model.model_fields) for model in models_in(StandConfig)]
-    rooms = (drivers.devices, drivers.wires, stand, stand.chamber, stand.guarding, stand.imaging, stand.table)
+    rooms = (
+        thermostand.drivers.devices,
+        thermostand.drivers.wires,
+        thermostand.stand,
+        thermostand.stand.chamber,
+        thermostand.stand.guarding,
+        thermostand.stand.imaging,
+        thermostand.stand.table,
+    )
     repeated = {
         each.__name__
         for each in classes(*rooms)

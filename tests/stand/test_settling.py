@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from experiments.steps import SoakUntilSettled
-from markers.detection import Detection
-from markers.edge_model import EdgeState
-from stand.imaging.settling import Rate, Seen, camera_rate, digit_K, drift_rate, judge, movement
+from thermostand.experiments.steps import SoakUntilSettled
+from thermostand.markers.detection import Detection
+from thermostand.markers.edge_model import EdgeState
+from thermostand.stand.imaging.settling import Rate, Seen, camera_rate, digit_K, drift_rate, judge, movement
 
 SOAK = SoakUntilSettled(
     max_s=2700.0,

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.steps import SoakUntilSettled, StartChamber, StopChamber, number_steps
-from foundation.clock import NS_PER_S
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Reading
-from stand.gate import INTERLOCK, OPERATOR
 from tests.compensation.rendered import Scene, photograph, render
 from tests.stand.small_stand import Life
+from thermostand.experiments.steps import SoakUntilSettled, StartChamber, StopChamber, number_steps
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Reading
+from thermostand.stand.gate import INTERLOCK, OPERATOR
 
 SOAK = SoakUntilSettled(1800.0, 60.0, 240.0, 60.0, 0.2, 0.003, 0.1, 24.0)
 PLAN = tuple(number_steps([StartChamber(24.0), SOAK, StopChamber()]))

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 import yaml
 
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from stand.config.stand_config import StandConfig, packaged
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import StandConfig, packaged
 
 Change = Callable[[dict[str, Any]], object]
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.errors import DeviceFault
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.readings import Quality
-from stand.table.stages import check_home, ready
 from tests.system.stage_bench import OVERSHOOT, UNIT_PER_STEP, Bench, Kind, running_bench
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import DeviceFault
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.readings import Quality
+from thermostand.stand.table.stages import check_home, ready
 
 
 @pytest.fixture

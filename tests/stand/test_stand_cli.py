@@ -11,13 +11,13 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from stand.commands.command_table import app
-from stand.config.stand_config import packaged
-from stand.estimating.estimate import price
-from stand.estimating.run_estimate import small_disk
-from stand.running.order import load_order
 from tests import forked
 from tests.addresses import move_to_free
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.estimating.estimate import price
+from thermostand.stand.estimating.run_estimate import small_disk
+from thermostand.stand.running.order import load_order
 
 runner = CliRunner()
 
@@ -133,7 +133,17 @@ def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_
     config.write_text(yaml.safe_dump(data))
     # In a process of its own: asyncio.run and signal handlers belong to a main thread.
     result = forked.run(
-        [sys.executable, "-m", "stand.cli", "run", "demo", "--config", str(config), "--out", str(tmp_path / "out")],
+        [
+            sys.executable,
+            "-m",
+            "thermostand.stand.cli",
+            "run",
+            "demo",
+            "--config",
+            str(config),
+            "--out",
+            str(tmp_path / "out"),
+        ],
         capture_output=True,
         text=True,
         env={**os.environ, "COLUMNS": "200"},
@@ -164,7 +174,7 @@ def test_ctrl_c_while_the_commands_are_imported_ends_with_a_line(tmp_path: Path)
         "import signal\nprint('importing', flush=True)\nwhile True:\n    signal.pause()\n"
     )
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-    command = [sys.executable, "-m", "stand.cli", "plan", "demo"]
+    command = [sys.executable, "-m", "thermostand.stand.cli", "plan", "demo"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as process:

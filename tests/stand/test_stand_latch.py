@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foundation.documents import parse_document
-from foundation.errors import SessionError
-from stand.config.stand_config import StandConfig, packaged
-from stand.fault import Fault
-from stand.running.opening.stand_latch import UNREADABLE, WITHIN_S, StandLatch, state_folder
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.fault import Fault
+from thermostand.stand.running.opening.stand_latch import UNREADABLE, WITHIN_S, StandLatch, state_folder
 
 FAULT = Fault("over_temperature", "thermometers.air is 61.00 degC")
 

@@ -16,17 +16,17 @@ from typing import Any
 import pytest
 from fastapi import APIRouter
 
-from foundation.items import Event
-from stand.serving.api.doors import Interface
-from stand.serving.api.stop_thread import StopThread
-from stand.serving.client import server_of
-from stand.serving.desk import Done, Who
-from stand.serving.secop.door import door_at
 from tests.asking import ask
 from tests.nightly import by_night
 from tests.stand.a_desk import ADesk, served
 from tests.stand.floods import FLOODS, PING, VIEW
 from tests.stand.test_interface_access import book, free_port
+from thermostand.foundation.items import Event
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.stop_thread import StopThread
+from thermostand.stand.serving.client import server_of
+from thermostand.stand.serving.desk import Done, Who
+from thermostand.stand.serving.secop.door import door_at
 
 LIMIT_S = 5.0
 STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n"

@@ -12,17 +12,17 @@ from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
-from foundation.items import StepMark, StepState
-from stand.serving.api import stream as streams
-from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.api.doors import Interface
-from stand.serving.api.stream import MOST_VIEWERS, Stream
-from stand.serving.client import server_of
-from stand.serving.desk import StandState
-from stand.serving.presence import living
 from tests.asking import ask
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import free_port
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.stand.serving.api import stream as streams
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.stream import MOST_VIEWERS, Stream
+from thermostand.stand.serving.client import server_of
+from thermostand.stand.serving.desk import StandState
+from thermostand.stand.serving.presence import living
 
 
 async def message(viewer: ClientConnection) -> dict[str, Any]:

@@ -5,15 +5,15 @@ from collections.abc import Callable
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Quality, Reading
-from stand.config.chamber_section import ChamberConfig
-from stand.fault import Fault
-from stand.guarding.drifting import drifting
-from stand.guarding.interlocks import disagreement
-from stand.guarding.suspects import Witnesses, telling
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.stand.config.chamber_section import ChamberConfig
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.drifting import drifting
+from thermostand.stand.guarding.interlocks import disagreement
+from thermostand.stand.guarding.suspects import Witnesses, telling
 
 PV, AIR, CEILING, GRANITE, CAMERA = (
     "regulator.pv",

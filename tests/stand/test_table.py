@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from foundation.errors import ConfigError, StandTripped, Unreachable
-from stand.fault import Fault
 from tests.stand.room_devices import rooms
+from thermostand.foundation.errors import ConfigError, StandTripped, Unreachable
+from thermostand.stand.fault import Fault
 
 
 async def test_a_stage_without_its_scale_is_homed_first():

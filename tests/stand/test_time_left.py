@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import (
+from tests.recording.recorded import record
+from tests.stand.priced_plans import BEGIN_NS, CAPTURE, marks, planned
+from thermostand.experiments.steps import (
     CloseFlap,
     CoolDown,
     MoveTo,
@@ -17,16 +19,14 @@ from experiments.steps import (
     StartChamber,
     Step,
 )
-from foundation.clock import NS_PER_S
-from foundation.items import Event, StepMark, StepState
-from recording.reading.session import Session
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.estimating.estimate import PricedStep, price
-from stand.estimating.eta import Eta
-from stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
-from stand.running.memory.entries import Change, Edited, Extended, Skipped, data_of
-from tests.recording.recorded import record
-from tests.stand.priced_plans import BEGIN_NS, CAPTURE, marks, planned
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.estimating.estimate import PricedStep, price
+from thermostand.stand.estimating.eta import Eta
+from thermostand.stand.estimating.learned import LEARNED_FILE, Learned, learn, load_learned, overheads_of
+from thermostand.stand.running.memory.entries import Change, Edited, Extended, Skipped, data_of
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from foundation.errors import ConfigError
-from stand.commands.token_cli import app
-from stand.config.interface_section import TokenFile, load_tokens, write_tokens
-from stand.config.stand_config import load_config, packaged
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.commands.token_cli import app
+from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
+from thermostand.stand.config.stand_config import load_config, packaged
 
 TOKEN = "correct-horse-battery-staple"
 

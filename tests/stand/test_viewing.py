@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.clock import WallClock
-from foundation.hub import Hub
-from foundation.items import Event, StepMark, StepState
-from foundation.readings import Frame
-from stand.serving.preview import Preview, Setup
-from stand.serving.recorded_drift import run_references
-from stand.serving.shot import Shot
-from stand.serving.viewing import Viewing
-from stand.watching.drift import drift_watched
 from tests.recording.recorded import MS, START_NS, record
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.foundation.readings import Frame
+from thermostand.stand.serving.preview import Preview, Setup
+from thermostand.stand.serving.recorded_drift import run_references
+from thermostand.stand.serving.shot import Shot
+from thermostand.stand.serving.viewing import Viewing
+from thermostand.stand.watching.drift import drift_watched
 
 TARGET = (Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml").read_text("utf-8")
 ROLES = ("warm_up", "reference", "reference", "fit", "calibration", "reference", "fit")
@@ -86,8 +86,8 @@ class InProcess:
 
 @asynccontextmanager
 async def viewing(session: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncGenerator[tuple[Viewing, Hub]]:
-    monkeypatch.setattr("stand.serving.viewing.Helper", lambda *_: InProcess())
-    monkeypatch.setattr("stand.serving.viewing.previewer", lambda _: Looking())
+    monkeypatch.setattr("thermostand.stand.serving.viewing.Helper", lambda *_: InProcess())
+    monkeypatch.setattr("thermostand.stand.serving.viewing.previewer", lambda _: Looking())
     hub = Hub()
     found = Viewing(hub, WallClock(), folder, TARGET)
     running = asyncio.create_task(found.run(lambda: session))
@@ -140,9 +140,9 @@ async def test_a_session_that_cannot_be_read_is_reported_and_frames_are_looked_a
 def test_at_the_terminal_a_resumed_runs_drift_counts_from_its_own_reference_too(
     session: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("stand.watching.drift.Helper", lambda *_: InProcess())
-    monkeypatch.setattr("stand.watching.drift.previewer", lambda _: Looking())
-    monkeypatch.setattr("stand.watching.drift._LOOK_S", 0.01)
+    monkeypatch.setattr("thermostand.stand.watching.drift.Helper", lambda *_: InProcess())
+    monkeypatch.setattr("thermostand.stand.watching.drift.previewer", lambda _: Looking())
+    monkeypatch.setattr("thermostand.stand.watching.drift._LOOK_S", 0.01)
     hub = Hub()
     with drift_watched(TARGET, session) as watch:
         watch.subscribe(hub)

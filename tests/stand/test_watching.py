@@ -10,24 +10,24 @@ import pytest
 from rich.console import Console
 from rich.live import Live
 
-from experiments.steps import Capture, Role, Soak, number_steps
-from foundation.clock import NS_PER_S
-from foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, SOAK_LONGER
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Reading, bad_reading
-from recording.format.utc_offsets import UtcOffsets
-from stand.commands.control_cli import idle_lines
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.estimate import price
-from stand.estimating.run_estimate import Night
-from stand.running.status import doing_in_words
-from stand.serving.desk import HeatByHand, ReadingState, StandState
-from stand.watching.follow import Follow
-from stand.watching.live import Foot, Lines
-from stand.watching.moment import Moment, moment_of
-from stand.watching.panel import panel_lines, plain_line
-from stand.watching.remedies import next_command
 from tests.stand.test_control_cli import STATUS
+from thermostand.experiments.steps import Capture, Role, Soak, number_steps
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, SOAK_LONGER
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.stand.commands.control_cli import idle_lines
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.estimating.estimate import price
+from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.running.status import doing_in_words
+from thermostand.stand.serving.desk import HeatByHand, ReadingState, StandState
+from thermostand.stand.watching.follow import Follow
+from thermostand.stand.watching.live import Foot, Lines
+from thermostand.stand.watching.moment import Moment, moment_of
+from thermostand.stand.watching.panel import panel_lines, plain_line
+from thermostand.stand.watching.remedies import next_command
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S  # 2026-01-01 18:00:00 UTC
 MOMENT = Moment(

@@ -8,11 +8,11 @@ from contextlib import asynccontextmanager, contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.sim.gige.camera import FakeCamera
-from drivers.wires.camera_settings import GigeCameraSettings
-from foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock
 from tests.addresses import usual_camera_address
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock
 
 SERIAL = "C0061"
 WIDTH_px, HEIGHT_px = 640, 480

@@ -8,19 +8,19 @@ from typing import Any
 import pytest
 import yaml
 
-from drivers.framing.aravis_library import library
-from drivers.sim.gige.camera import FakeCamera
-from foundation.clock import WallClock
-from foundation.documents import load_document, yaml_data
-from foundation.errors import StandError
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.order import Order
-from stand.simulator import Simulator, laboratory_of
 from tests.addresses import move_to_free
 from tests.forked import OWN_HELPERS
 from tests.sections import change
 from tests.system.camera_bench import START_NS, WarmPlant, simulated
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.documents import load_document, yaml_data
+from thermostand.foundation.errors import StandError
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.running.order import Order
+from thermostand.stand.simulator import Simulator, laboratory_of
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.

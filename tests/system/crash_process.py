@@ -11,15 +11,15 @@ import os
 import sys
 from pathlib import Path
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.hub import Hub
-from recording.writing.disk import Disk
-from recording.writing.recorder import Recorder
-from stand.chamber.compressor import CompressorState, keep
-from stand.queueing.queue_file import changing
-from stand.running.memory.entries import Begun, Dwell
-from stand.running.memory.journal import Journal
 from tests.system.recording_process import INFO, MESSAGES_PER_ROUND, SETTINGS, batches_of, frame_of
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.recorder import Recorder
+from thermostand.stand.chamber.compressor import CompressorState, keep
+from thermostand.stand.queueing.queue_file import changing
+from thermostand.stand.running.memory.entries import Begun, Dwell
+from thermostand.stand.running.memory.journal import Journal
 
 SESSION, QUEUE, COMPRESSOR, CONTROL = "session", "runs", "state/compressor.json", "control"
 PAUSE_S = 0.005

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Event
-from foundation.patience import Patience
-from foundation.readings import Frame
-from recording.writing.disk import Disk
-from recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
-from stand.running.memory.entries import Begun, Dwell, Ended
-from stand.running.memory.journal import Journal, Logbook
-from stand.running.memory.state import RunState
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.readings import Frame
+from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
+from thermostand.stand.running.memory.entries import Begun, Dwell, Ended
+from thermostand.stand.running.memory.journal import Journal, Logbook
+from thermostand.stand.running.memory.state import RunState
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", telemetry_commit_s=0.05, stop_frames_below_bytes=0, alert_below_fraction=0.0)

@@ -10,12 +10,12 @@ from typing import cast
 
 from usb.core import USBError
 
-from drivers.devices.motion.flap import Flap, FlapSettings
-from drivers.sim.motion.flap import MAX_DUTY_FORWARD, FakeFlap
-from drivers.sim.physics.plant import Plant
-from drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer
-from foundation.clock import FollowedClock, VirtualClock, seconds_ns
-from foundation.readings import Quality, Reading
+from thermostand.drivers.devices.motion.flap import Flap, FlapSettings
+from thermostand.drivers.sim.motion.flap import MAX_DUTY_FORWARD, FakeFlap
+from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer
+from thermostand.foundation.clock import FollowedClock, VirtualClock, seconds_ns
+from thermostand.foundation.readings import Quality, Reading
 
 T0 = 1_700_000_000_000_000_000
 OURS, OTHER = "00351210", "00351299"

@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from stand.running.order import Order
 from tests.addresses import free_port
+from thermostand.stand.running.order import Order
 
 
 class Gateway:

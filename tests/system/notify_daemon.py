@@ -10,8 +10,8 @@ import resource
 import sys
 from contextlib import suppress
 
-from foundation.clock import WallClock
-from stand.guarding.notify import Notifier
+from thermostand.foundation.clock import WallClock
+from thermostand.stand.guarding.notify import Notifier
 
 
 def say(text):

@@ -22,11 +22,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from foundation.clock import NS_PER_S
-from foundation.hub import Hub
-from foundation.items import Item
-from stand.running.order import Order
-from stand.running.run import run_virtual
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 POLL_s = 1.0
 PROTOCOL = """

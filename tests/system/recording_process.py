@@ -18,15 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.hub import Hub
-from foundation.items import Batch
-from foundation.readings import Frame, Reading
-from recording.format import messages
-from recording.format.images import CAMERA_IMAGE, encode_image
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
-from recording.writing.segment import Record
-from recording.writing.telemetry import BatchEncoder
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.format import messages
+from thermostand.recording.format.images import CAMERA_IMAGE, encode_image
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
+from thermostand.recording.writing.segment import Record
+from thermostand.recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 PERIOD_NS = NS_PER_S // 100

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from drivers.devices.regulators.pid import Law
-from drivers.devices.regulators.software_regulator import SoftwareRegulator
 from tests.system.virtual_stand import VirtualStand, bare_config, virtual_stand
+from thermostand.drivers.devices.regulators.pid import Law
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
 
 Kind = Literal["simulated", "software-regulator"]
 FROM_degC, FROM_s = 20.0, 5400.0

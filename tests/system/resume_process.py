@@ -13,11 +13,11 @@ from pathlib import Path
 from signal import SIGKILL
 from threading import Timer
 
-from foundation.items import StepMark, StepState
-from foundation.readings import Frame
-from stand.running.resume import interruption
-from stand.running.run import resume, run_virtual
 from tests import forked
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.foundation.readings import Frame
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import resume, run_virtual
 
 DOWNTIME_S = 45.0
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import yaml
 
-from foundation.documents import load_document
-from stand.config.recipe import Recipe
-from stand.config.stand_config import load_config, packaged
-from stand.running.order import Order
 from tests.addresses import camera_address, free_port
+from thermostand.foundation.documents import load_document
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.running.order import Order
 
 
 def simulated_order(directory: Path, recipe: str, poll_s: float | None = None) -> Order:

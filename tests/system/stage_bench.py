@@ -8,15 +8,15 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Literal, cast
 
-from drivers.devices.motion.stage import Axis, AxisSettings
-from drivers.framing.ximc import encode
-from drivers.sim.faults import LinkFaults
-from drivers.sim.motion.ximc import FakeAxis, XimcEngine
-from drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
-from drivers.sim.physics.plant import Plant
-from drivers.sim.wire import PtyWire, TcpWire
-from foundation.clock import FollowedClock, VirtualClock, seconds_ns
-from foundation.readings import Reading
+from thermostand.drivers.devices.motion.stage import Axis, AxisSettings
+from thermostand.drivers.framing.ximc import encode
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.motion.ximc import FakeAxis, XimcEngine
+from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
+from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.foundation.clock import FollowedClock, VirtualClock, seconds_ns
+from thermostand.foundation.readings import Reading
 
 T0 = 1_700_000_000_000_000_000
 SERIAL_NUMBER = 4101

@@ -7,9 +7,9 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from recording.reading.session import Session
-from stand.commands.command_table import app
 from tests.system.conftest import require_aravis
+from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.command_table import app
 
 RECIPE = """
 name: one

@@ -6,16 +6,16 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from recording.reading.session import Session
 from tests import forked
 from tests.system.conftest import require_aravis
+from thermostand.recording.reading.session import Session
 
 PROMPTED = """
 name: prompted
 experiments:
   - warm_up: {table_position: {linear: 0, rotary: 0}, frames: 2, cool_down_max_s: 10, rolls_deg: [20]}
 """
-STAND = [sys.executable, "-m", "stand.cli"]
+STAND = [sys.executable, "-m", "thermostand.stand.cli"]
 
 
 def attended(*arguments: object) -> subprocess.Popen[str]:

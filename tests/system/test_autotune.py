@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from foundation.hub import Hub
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.asking import ask, ask_status
 from tests.nightly import by_night
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_guard_run import Watcher, check_safe
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import break_now
+from thermostand.foundation.hub import Hub
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 
 @pytest.fixture(autouse=True)

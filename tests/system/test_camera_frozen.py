@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.items import Batch
-from foundation.readings import Quality
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import break_now
+from thermostand.foundation.items import Batch
+from thermostand.foundation.readings import Quality
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 
 @pytest.fixture(autouse=True)

@@ -6,11 +6,6 @@ import sys
 
 import pytest
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.sim.gige.camera import FakeCamera
-from drivers.wires import camera_connection
-from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import Refused, Unreachable
 from tests.addresses import usual_camera_address
 from tests.system.camera_bench import (
     EXPOSURE_S,
@@ -23,6 +18,11 @@ from tests.system.camera_bench import (
     virtual,
 )
 from tests.system.conftest import require_aravis
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.wires import camera_connection
+from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.errors import Refused, Unreachable
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -181,9 +181,9 @@ async def test_while_another_client_controls_the_camera_open_is_refused():
 
 CRASH = """
 import asyncio, os, sys
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.wires.camera_settings import GigeCameraSettings
-from foundation.clock import WallClock
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.foundation.clock import WallClock
 asyncio.run(Camera("camera", GigeCameraSettings(address=sys.argv[1], heartbeat_s=1.5), WallClock()).open())
 os._exit(0)
 """

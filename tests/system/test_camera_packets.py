@@ -6,14 +6,14 @@ from collections.abc import AsyncGenerator
 
 import pytest
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.sim.gige.camera import FakeCamera
-from drivers.sim.gige.gvsp_sender import StreamSender
-from drivers.wires import camera_connection
-from foundation.clock import NS_PER_S, VirtualClock, WallClock
-from foundation.errors import Unreachable
-from foundation.readings import Frame
 from tests.system.camera_bench import WarmPlant, noise, opened, simulated, virtual
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.sim.gige.gvsp_sender import StreamSender
+from thermostand.drivers.wires import camera_connection
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, WallClock
+from thermostand.foundation.errors import Unreachable
+from thermostand.foundation.readings import Frame
 
 FRAMES = 5
 

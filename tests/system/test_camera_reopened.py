@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.items import Batch
-from recording.reading.session import Session
-from stand.running.order import Order
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_run import fault
 from tests.system.test_unrecorded_heat import SOAK, happens, heating
+from thermostand.foundation.items import Batch
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
 
 
 @pytest.fixture(autouse=True)

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.readings import Frame
-from recording.format.restarts import begins_of, is_superseded
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
 from tests.system.test_run_ends import SHORTER, break_now
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 
 @pytest.fixture(autouse=True)

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S
-from foundation.hub import Hub
-from recording.reading.session import Session
-from stand.running.memory.entries import Dwell
-from stand.running.memory.journal import JOURNAL_NAME
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.journals import read_lines
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.hub import Hub
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.memory.entries import Dwell
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: supply

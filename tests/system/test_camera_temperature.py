@@ -9,21 +9,21 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from experiments.steps import Capture, PlannedStep, Role, Soak
-from foundation.clock import NS_PER_S
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from foundation.readings import Reading, bad_reading
-from recording.reading.session import Session
-from stand.commands.command_table import app
-from stand.config.stand_config import load_config, packaged
-from stand.guarding.rules import camera_measured
-from stand.running.memory.entries import Again, Step
-from stand.running.memory.fold import after, fold
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
 from tests.system.test_run import at_step, fault
+from thermostand.experiments.steps import Capture, PlannedStep, Role, Soak
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.guarding.rules import camera_measured
+from thermostand.stand.running.memory.entries import Again, Step
+from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 CAPTURES = """
 name: captures

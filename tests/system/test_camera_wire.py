@@ -7,12 +7,6 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.sim.gige.camera import FakeCamera
-from drivers.wires.camera_settings import TemperatureFeature
-from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import DeviceFault, Refused
-from foundation.readings import Quality
 from tests.system.camera_bench import (
     EXPOSURE_S,
     SERIAL,
@@ -25,6 +19,12 @@ from tests.system.camera_bench import (
     virtual,
 )
 from tests.system.conftest import require_aravis
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.sim.gige.camera import FakeCamera
+from thermostand.drivers.wires.camera_settings import TemperatureFeature
+from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.errors import DeviceFault, Refused
+from thermostand.foundation.readings import Quality
 
 
 @pytest.fixture(autouse=True, scope="module")

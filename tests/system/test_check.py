@@ -12,24 +12,24 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from foundation.clock import WallClock
-from foundation.documents import read_document
-from foundation.errors import DeviceFault, InUse
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.commands.check_cli import app
-from stand.commissioning.answering import not_answering
-from stand.commissioning.commissioning import commission
-from stand.commissioning.finding import Finding
-from stand.config.checked import doubt, load_checked
-from stand.config.stand_config import load_config
-from stand.running.opening.claim import claimed
-from stand.running.opening.open_stand import opened
-from stand.running.opening.stop import Interrupted, Stop
-from stand.running.order import Order, load_order, register_texts
-from stand.simulator import ControlSocket, Simulator
 from tests.addresses import free_port
 from tests.system.conftest import require_aravis
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.documents import read_document
+from thermostand.foundation.errors import DeviceFault, InUse
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.commands.check_cli import app
+from thermostand.stand.commissioning.answering import not_answering
+from thermostand.stand.commissioning.commissioning import commission
+from thermostand.stand.commissioning.finding import Finding
+from thermostand.stand.config.checked import doubt, load_checked
+from thermostand.stand.config.stand_config import load_config
+from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.opening.open_stand import opened
+from thermostand.stand.running.opening.stop import Interrupted, Stop
+from thermostand.stand.running.order import Order, load_order, register_texts
+from thermostand.stand.simulator import ControlSocket, Simulator
 
 
 @pytest.fixture

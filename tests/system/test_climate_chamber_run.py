@@ -7,19 +7,19 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foundation.documents import load_document, parse_document
-from foundation.errors import ConfigError, DeviceFault
-from recording.reading.session import Session
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.addresses import free_port
 from tests.asking import ask
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated, trips_of
 from tests.system.test_run import fault, ignore
 from tests.system.test_run_ends import SHORTER
+from thermostand.foundation.documents import load_document, parse_document
+from thermostand.foundation.errors import ConfigError, DeviceFault
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 MAKES = ("espec", "cts", "ascii2")
 NIGHTLY = [pytest.param(make, marks=pytest.mark.nightly) for make in ("simserv", "julabo")]

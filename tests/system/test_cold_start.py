@@ -9,25 +9,25 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import Capture, PowerCamera, Prompt
-from foundation.clock import NS_PER_S
-from foundation.hub import Hub
-from foundation.items import Event, Item, StepMark, StepState
-from foundation.readings import Frame
-from recording.format.restarts import begins_of, is_superseded
-from recording.reading.session import Session
-from stand.running.executing.actions import cold_start
-from stand.running.memory.entries import Step
-from stand.running.memory.fold import fold
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import run_virtual
 from tests.asking import ask
 from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher
 from tests.system.test_resume import end_laboratory
 from tests.system.test_run import fault
+from thermostand.experiments.steps import Capture, PowerCamera, Prompt
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.executing.actions import cold_start
+from thermostand.stand.running.memory.entries import Step
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import run_virtual
 
 WARM_UP = """
 name: warm

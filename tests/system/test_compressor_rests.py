@@ -5,14 +5,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from foundation.clock import seconds_ns
-from stand.chamber.compressor import restored
-from stand.config.stand_config import CompressorConfig
-from stand.running.order import Order
 from tests.system.conftest import AS_INSTALLED
 from tests.system.gateway import gateway
 from tests.system.test_guard_wire import Start, bench_from
 from tests.system.test_relay_keeper import COMPRESSOR, ON, RELAYS, another_master, seconds_until
+from thermostand.foundation.clock import seconds_ns
+from thermostand.stand.chamber.compressor import restored
+from thermostand.stand.config.stand_config import CompressorConfig
+from thermostand.stand.running.order import Order
 
 POLLED = AS_INSTALLED
 

@@ -18,18 +18,18 @@ from dataclasses import dataclass
 
 import pytest
 
-from foundation.clock import NS_PER_S
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_unfinished
-from stand.chamber.compressor import restored
-from stand.queueing.queue_file import read_queue
-from stand.running.memory.journal import Journal
 from tests.system.crash_process import COMPRESSOR, CONTROL, QUEUE, SESSION, journal_entry
 from tests.system.logged_disk import FLUSH, LIMIT_S, MARK, WRITE, Entry, logged_disk, read_log
 from tests.system.recording_process import frame_records, telemetry_records
 from tests.system.test_kill_recording import read_series
 from tests.system.test_power_cut import mounted
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_unfinished
+from thermostand.stand.chamber.compressor import restored
+from thermostand.stand.queueing.queue_file import read_queue
+from thermostand.stand.running.memory.journal import Journal
 
 STATES = 200
 DISK_BYTES = 48 << 20

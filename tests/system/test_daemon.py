@@ -15,23 +15,23 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import WallClock
-from foundation.errors import SessionError
-from foundation.hub import Hub
-from foundation.items import Event
-from recording.reading.notes import read_notes
-from recording.reading.session import Session
-from stand.assembly import assemble
-from stand.config.stand_config import load_config, packaged
-from stand.daemon.daemon_desk import DaemonDesk
-from stand.daemon.serve import serve as serve_stand
-from stand.running.guest import Guest
-from stand.serving.client import Server, server_of
-from stand.serving.desk import Conflict, RunRequest, StandState, Who
 from tests import forked
 from tests.nightly import by_night
 from tests.system.test_real_time import BRIEF as CYCLE
 from tests.system.test_two_runs import Laboratory
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.recording.reading.notes import read_notes
+from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.daemon.daemon_desk import DaemonDesk
+from thermostand.stand.daemon.serve import serve as serve_stand
+from thermostand.stand.running.guest import Guest
+from thermostand.stand.serving.client import Server, server_of
+from thermostand.stand.serving.desk import Conflict, RunRequest, StandState, Who
 
 LIMIT_S = 120.0  # for a busy machine
 BRIEF = """
@@ -47,7 +47,7 @@ class Served:
     def __init__(self, config_file: Path, out: Path) -> None:
         self.out = out
         arguments = ["--config", str(config_file), "--out", str(out), "--no-reports"]
-        command = [sys.executable, "-m", "stand.cli", "serve", *arguments]
+        command = [sys.executable, "-m", "thermostand.stand.cli", "serve", *arguments]
         self.process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     @property
@@ -222,7 +222,15 @@ def test_a_killed_daemon_drops_the_heat_and_its_run_is_offered_and_resumed(
     assert not offered.heater_permitted
     assert offered.readings["relays.heater_enable"].value == 0
     session = offered.queue[0].session
-    command = [sys.executable, "-m", "stand.cli", "resume", str(again.out / session), "--config", str(laboratory)]
+    command = [
+        sys.executable,
+        "-m",
+        "thermostand.stand.cli",
+        "resume",
+        str(again.out / session),
+        "--config",
+        str(laboratory),
+    ]
     follower = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     again.until(lambda state: state.run is not None)
     with pytest.raises(subprocess.TimeoutExpired):
@@ -262,7 +270,17 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(
     finally:
         elsewhere.process.send_signal(signal.SIGKILL)
         elsewhere.process.communicate()
-    run = [sys.executable, "-m", "stand.cli", "run", "warm-up", "--config", str(laboratory), "--out", str(tmp_path)]
+    run = [
+        sys.executable,
+        "-m",
+        "thermostand.stand.cli",
+        "run",
+        "warm-up",
+        "--config",
+        str(laboratory),
+        "--out",
+        str(tmp_path),
+    ]
     refused = forked.popen(run, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert "the stand has tripped" in refused.communicate()[0]
     assert refused.returncode == 1
@@ -288,7 +306,7 @@ def test_a_trip_that_somebody_has_heard_of_is_never_forgotten(laboratory: Path, 
         finally:
             served.process.send_signal(signal.SIGKILL)
             served.process.communicate()
-        clear = [sys.executable, "-m", "stand.cli", "clear", "--config", str(laboratory)]
+        clear = [sys.executable, "-m", "thermostand.stand.cli", "clear", "--config", str(laboratory)]
         cleared = forked.popen(clear, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         assert "cleared: the folder" in cleared.communicate()[0]
         assert cleared.returncode == 0
@@ -320,7 +338,16 @@ def test_the_end_of_the_daemon_ends_its_run_which_may_be_resumed(serve: Callable
 def run_command(config_file: Path, recipe: str, *options: str) -> "subprocess.Popen[str]":
     recipe_file = config_file.with_name("recipe.yaml")
     recipe_file.write_text(recipe)
-    command = [sys.executable, "-m", "stand.cli", "run", str(recipe_file), "--config", str(config_file), *options]
+    command = [
+        sys.executable,
+        "-m",
+        "thermostand.stand.cli",
+        "run",
+        str(recipe_file),
+        "--config",
+        str(config_file),
+        *options,
+    ]
     return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -11,17 +11,17 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foundation.clock import WallClock
-from foundation.hub import Hub
-from foundation.items import Event
-from stand.config.stand_config import load_config, packaged
-from stand.daemon.daemon import Daemon
-from stand.daemon.daemon_desk import DaemonDesk
-from stand.daemon.serve import serve as serve_stand
-from stand.serving.api.doors import Interface
-from stand.serving.api.server import serve as serve_clients
-from stand.serving.client import server_of
 from tests.stand.alert_receiver import Receiver
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.daemon.daemon import Daemon
+from thermostand.stand.daemon.daemon_desk import DaemonDesk
+from thermostand.stand.daemon.serve import serve as serve_stand
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.server import serve as serve_clients
+from thermostand.stand.serving.client import server_of
 
 LIMIT_S = 120.0  # for a busy machine
 WATCHDOG_S = 1.5

@@ -11,25 +11,25 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError, StandTripped
-from foundation.items import StepState
-from recording.reading.glance import glance
-from recording.reading.journal_lines import JOURNAL_NAME
-from recording.reading.run_word import Files, Run
-from recording.reading.session import Session
-from recording.reading.using import open_whole
-from recording.repair.salvage import salvage_session
-from recording.repair.verify import verify
-from stand.running.memory.entries import Tripped
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import Interrupted, resume, run_virtual
 from tests.journals import read_lines
 from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, fault, ignore
 from tests.system.test_run_ends import SHORTER
+from thermostand.foundation.errors import SessionError, StandTripped
+from thermostand.foundation.items import StepState
+from thermostand.recording.reading.glance import glance
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.session import Session
+from thermostand.recording.reading.using import open_whole
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.repair.verify import verify
+from thermostand.stand.running.memory.entries import Tripped
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import Interrupted, resume, run_virtual
 
 
 @pytest.fixture(autouse=True)

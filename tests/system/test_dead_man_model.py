@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from stand.chamber.keeper import SUPERVISED_S
-from stand.config.guard_section import GuardConfig
-from stand.guarding.guard import LATE_PERIODS
+from thermostand.stand.chamber.keeper import SUPERVISED_S
+from thermostand.stand.config.guard_section import GuardConfig
+from thermostand.stand.guarding.guard import LATE_PERIODS
 
 MODEL = Path(__file__).with_name("dead_man.pml")
 GUARD = GuardConfig()

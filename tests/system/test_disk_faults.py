@@ -17,34 +17,34 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from foundation.clock import NS_PER_S, Boot, VirtualClock
-from foundation.errors import ConfigError, SessionError
-from foundation.hub import Hub
-from foundation.items import Batch, Event, StepMark, StepState
-from foundation.readings import Frame, Reading
-from foundation.sealed import seal
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.notes import add_note, add_tags, read_notes
-from recording.writing.recorder import Recorder
-from recording.writing.recorder_settings import RecordingSettings, SessionInfo
-from stand.chamber.compressor import CompressorState, keep, restored
-from stand.commands.command_table import app
-from stand.config.interface_section import TokenFile, load_tokens, write_tokens
-from stand.config.stand_config import load_config, packaged
-from stand.daemon.daemon_file import Kept, kept_in
-from stand.estimating.learned import Learned, load_learned
-from stand.fault import Fault
-from stand.queueing import queue
-from stand.running.memory.entries import Dwell, Ended, Held, Step, Tripped
-from stand.running.memory.journal import JOURNAL_NAME, Journal
-from stand.running.opening.stand_latch import StandLatch
-from stand.running.order import load_order
-from stand.running.resume import begun, interruption
 from tests.journals import read_lines
 from tests.nightly import by_night
 from tests.recording.damage import read_segment
 from tests.system.disk_faults import KINDS, kind_of, put_back, states, tree_of
 from tests.system.test_kill_recording import read_series
+from thermostand.foundation.clock import NS_PER_S, Boot, VirtualClock
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.foundation.sealed import seal
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.notes import add_note, add_tags, read_notes
+from thermostand.recording.writing.recorder import Recorder
+from thermostand.recording.writing.recorder_settings import RecordingSettings, SessionInfo
+from thermostand.stand.chamber.compressor import CompressorState, keep, restored
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.daemon.daemon_file import Kept, kept_in
+from thermostand.stand.estimating.learned import Learned, load_learned
+from thermostand.stand.fault import Fault
+from thermostand.stand.queueing import queue
+from thermostand.stand.running.memory.entries import Dwell, Ended, Held, Step, Tripped
+from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
+from thermostand.stand.running.opening.stand_latch import StandLatch
+from thermostand.stand.running.order import load_order
+from thermostand.stand.running.resume import begun, interruption
 
 START_NS = 1_767_290_400 * NS_PER_S
 TRIPPED, KILLED = "20260101T180000Z-tripped", "20260102T180000Z-killed"

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import Capture
-from foundation.items import Event, Item
-from foundation.readings import Frame
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.readings import Frame
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: disk

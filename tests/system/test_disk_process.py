@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from recording.reading.gaps import reported_blocks
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_session
-from recording.writing import locks
-from recording.writing.disk import LEFT_NAME
-from stand.running.memory.entries import Ended
-from stand.running.memory.journal import Journal
 from tests.journals import read_lines
 from tests.recording.disks import ext4, run
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.gaps import reported_blocks
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.writing import locks
+from thermostand.recording.writing.disk import LEFT_NAME
+from thermostand.stand.running.memory.entries import Ended
+from thermostand.stand.running.memory.journal import Journal
 
 LIMIT_S = 60.0  # for what takes milliseconds, on a machine that has other things to do
 

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import observe
-from foundation.hub import Hub
-from foundation.items import Batch, Item, StepMark, StepState
-from foundation.readings import TEMPERATURE_IN_DOUBT, Quality
-from recording.exporting.frames_file import frames_rows
-from recording.reading.overview import overview
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 from tests.system.test_run_ends import break_now
+from thermostand.compensation.observations import observe
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Item, StepMark, StepState
+from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, Quality
+from thermostand.recording.exporting.frames_file import frames_rows
+from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 OFFSET_K = 10.0
 RECIPE = """

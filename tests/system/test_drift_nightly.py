@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.drift.choosing import fit
-from compensation.drift.drift_model import DriftModel
-from compensation.drift.evaluation import evaluate
-from compensation.drift.training import frame_states
-from compensation.observations import Observations, observe
-from experiments.steps import Role
-from foundation.hub import Hub
-from foundation.items import Item
-from foundation.progress import progress
-from foundation.readings import Frame
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
+from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.evaluation import evaluate
+from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Observations, observe
+from thermostand.experiments.steps import Role
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item
+from thermostand.foundation.progress import progress
+from thermostand.foundation.readings import Frame
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 

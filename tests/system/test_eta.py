@@ -7,21 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import Soak
-from foundation.clock import NS_PER_S
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepMark, StepState
-from recording.reading.session import Session
-from stand.config.stand_config import packaged
-from stand.estimating.estimate import price
-from stand.estimating.learned import learn, load_learned
-from stand.estimating.run_estimate import Night
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import Interrupted, resume, run_virtual
-from stand.watching.follow import Follow
-from stand.watching.moment import Moment
 from tests.system.conftest import CORNER, SHORT_RECIPE, require_aravis
+from thermostand.experiments.steps import Soak
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.estimating.estimate import price
+from thermostand.stand.estimating.learned import learn, load_learned
+from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import Interrupted, resume, run_virtual
+from thermostand.stand.watching.follow import Follow
+from thermostand.stand.watching.moment import Moment
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 

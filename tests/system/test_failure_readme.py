@@ -18,7 +18,9 @@ def test_each_test_that_the_table_names_exists():
 
 
 def test_each_fault_that_the_table_names_is_one_of_the_simulator():
-    listed = subprocess.run([sys.executable, "-m", "drivers.sim", "--faults"], capture_output=True, check=True).stdout
+    listed = subprocess.run(
+        [sys.executable, "-m", "thermostand.drivers.sim", "--faults"], capture_output=True, check=True
+    ).stdout
     known = {row["name"] for row in json.loads(listed)}
     named = set(
         re.findall(

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.faults import LinkFaults
-from drivers.sim.units.modbus import Handler, RtuEngine, TcpEngine, answer, reads_bits, reads_words
-from drivers.sim.wire import PtyWire, TcpWire
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.registers import Space
-from foundation.clock import WallClock
-from foundation.errors import DeviceError
+from thermostand.drivers.sim.faults import LinkFaults
+from thermostand.drivers.sim.units.modbus import Handler, RtuEngine, TcpEngine, answer, reads_bits, reads_words
+from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.registers import Space
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import DeviceError
 
 TIMEOUT_S = 0.05
 LATE_S = 0.08  # later than the time-out, within the quarantine that follows it

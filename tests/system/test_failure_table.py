@@ -14,20 +14,20 @@ from typing import Any
 
 import pytest
 
-from drivers.wires import camera_connection
-from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
-from foundation.errors import ConfigError, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from foundation.readings import Quality, Reading
-from stand.assembly import Assembly, assemble
-from stand.running.order import Order
-from stand.running.simulated_faults import break_or_mend, simulated_faults
-from stand.serving.desk import FaultRequest, Missing
-from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.nightly import by_night
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.simulated_orders import simulated_order
+from thermostand.drivers.wires import camera_connection
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.simulated_faults import break_or_mend, simulated_faults
+from thermostand.stand.serving.desk import FaultRequest, Missing
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 PERIOD_S = 1.0
 OTHERS = ("regulator.pv", "thermometers.air", "relays.heater_enable", "linear.position", "flap.position")

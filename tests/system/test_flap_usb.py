@@ -5,9 +5,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.devices.motion.flap import Flap
-from drivers.sim.usb import Stall, TimedOut, UsbServer
-from foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
+from thermostand.drivers.devices.motion.flap import Flap
+from thermostand.drivers.sim.usb import Stall, TimedOut, UsbServer
+from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 from .flap_bench import GET_VARIABLES, OTHER, OURS, SET_TARGET, Bench, running_bench
 

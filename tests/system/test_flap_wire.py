@@ -6,17 +6,17 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.devices.motion.flap import Flap
-from drivers.sim.motion.flap import (
+from thermostand.drivers.devices.motion.flap import Flap
+from thermostand.drivers.sim.motion.flap import (
     ERROR_FEEDBACK_DISCONNECT,
     ERROR_HARD_OVER_CURRENT,
     ERROR_NO_POWER,
     ERROR_SOFT_OVER_CURRENT,
 )
-from drivers.sim.usb import TimedOut
-from foundation.clock import WallClock
-from foundation.errors import DeviceFault, Refused, Superseded, Unreachable
-from foundation.readings import Quality, Reading
+from thermostand.drivers.sim.usb import TimedOut
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.errors import DeviceFault, Refused, Superseded, Unreachable
+from thermostand.foundation.readings import Quality, Reading
 
 from .flap_bench import GET_RAM_SETTINGS, GET_VARIABLES, SET_TARGET, SETTINGS, STOP_MOTOR, T0, Bench, running_bench
 

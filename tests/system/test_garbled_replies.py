@@ -5,16 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import StandTripped
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from foundation.readings import Quality
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import SHORTER, break_now
+from thermostand.foundation.errors import StandTripped
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.readings import Quality
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 POLLED = AS_INSTALLED
 

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import observe
-from foundation.events import SOAK_LONGER
-from foundation.hub import Hub
-from foundation.items import Event, Item, StepMark, StepState
-from foundation.readings import UNSETTLED
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import Interrupted, resume, run_virtual
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 from tests.system.test_step_faults import Operator, run_with
+from thermostand.compensation.observations import observe
+from thermostand.foundation.events import SOAK_LONGER
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.foundation.readings import UNSETTLED
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import Interrupted, resume, run_virtual
 
 RECIPE = """
 name: soaked

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.errors import SessionError
-from stand.running.order import Order
 from tests.asking import ask_status
 from tests.recording.disks import ext4, run
 from tests.stand.test_listening import STATE, connected
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault
 from tests.system.test_unrecorded_heat import heater_is
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.running.order import Order
 
 FRAMES = """
 name: frames
@@ -95,7 +95,10 @@ async def test_the_guard_looks_on_and_a_stop_leaves_while_everything_hangs(
         out = disk / "out"
         command = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "config.yaml", "--out", out]
         process = subprocess.Popen(
-            [sys.executable, "-m", "stand.cli", *command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "thermostand.stand.cli", *command],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
         )
         try:
             async with asyncio.timeout(LIMIT_S):

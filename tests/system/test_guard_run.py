@@ -11,22 +11,22 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.errors import SessionError, StandTripped
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from recording.reading.session import Session
-from stand.running.memory.entries import Cleared, Tripped
-from stand.running.memory.journal import JOURNAL_NAME
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import Interrupted, run_virtual
 from tests.asking import ask, ask_status
 from tests.journals import read_lines
 from tests.nightly import by_night
 from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step, fault
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import SessionError, StandTripped
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.memory.entries import Cleared, Tripped
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import Interrupted, run_virtual
 
 POLLED = AS_INSTALLED
 

@@ -15,19 +15,19 @@ from typing import Any
 
 import pytest
 
-from foundation.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Event
-from recording.reading.session import Session
-from stand.assembly import Assembly, assemble
-from stand.chamber.compressor import CompressorState, keep
-from stand.config.stand_config import CompressorConfig, StandConfig, packaged
-from stand.fault import Fault
-from stand.guarding.rules import Announcements, watches
-from stand.running.order import Order
-from stand.running.run import run_virtual
-from stand.simulator import ControlSocket, Simulator
 from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE, require_aravis
+from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.chamber.compressor import CompressorState, keep
+from thermostand.stand.config.stand_config import CompressorConfig, StandConfig, packaged
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
+from thermostand.stand.simulator import ControlSocket, Simulator
 
 POLLED = AS_INSTALLED
 

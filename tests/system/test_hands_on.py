@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from recording.format.images import decode_png
-from stand.commands.order_cli import app
-from stand.config.stand_config import load_config
-from stand.running.order import Order
-from stand.simulator import Simulator
 from tests.system.conftest import require_aravis
 from tests.system.test_check import laboratory
+from thermostand.recording.format.images import decode_png
+from thermostand.stand.commands.order_cli import app
+from thermostand.stand.config.stand_config import load_config
+from thermostand.stand.running.order import Order
+from thermostand.stand.simulator import Simulator
 
 
 @pytest.fixture

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-import stand
-from drivers.sim.laboratory_faults import FAULTS
-from foundation.clock import NS_PER_S
-from stand.config.stand_config import StandConfig
-from stand.running.order import Order
-from stand.simulator import Simulator
 from tests.system.conftest import AS_INSTALLED
 from tests.system.hazards import HAZARDS, MEASURED, Trial, document
 from tests.system.test_guard_wire import Bench, bench_of
+from thermostand import stand
+from thermostand.drivers.sim.laboratory_faults import FAULTS
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.order import Order
+from thermostand.stand.simulator import Simulator
 
 POLLED = AS_INSTALLED
 
@@ -43,7 +43,9 @@ def rules_of_the_guard() -> Iterator[str]:
             if isinstance(rule, ast.Constant):
                 yield str(rule.value)
             elif isinstance(rule, ast.Name):
-                module = importlib.import_module(".".join(path.relative_to(ROOM.parent).with_suffix("").parts))
+                module = importlib.import_module(
+                    ".".join(("thermostand", *path.relative_to(ROOM.parent).with_suffix("").parts))
+                )
                 yield getattr(module, rule.id)
 
 

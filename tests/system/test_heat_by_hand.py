@@ -8,18 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import WallClock
-from foundation.hub import Hub
-from foundation.items import Batch, Event
-from foundation.readings import bad_reading
-from recording.reading.session import Session
-from stand.config.stand_config import load_config, packaged
-from stand.daemon.daemon import Daemon
-from stand.daemon.daemon_desk import DaemonDesk
-from stand.daemon.day_record import DayRecord
-from stand.daemon.serve import serve as serve_stand
-from stand.serving.desk import Who
 from tests.system.test_daemon import LIMIT_S
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import bad_reading
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.daemon.daemon import Daemon
+from thermostand.stand.daemon.daemon_desk import DaemonDesk
+from thermostand.stand.daemon.day_record import DayRecord
+from thermostand.stand.daemon.serve import serve as serve_stand
+from thermostand.stand.serving.desk import Who
 
 
 async def test_midnight_changes_the_record_beneath_heat_by_hand(

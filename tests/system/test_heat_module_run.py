@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import yaml
 
-from foundation.errors import DeviceFault
-from stand.config.stand_config import load_config, packaged
-from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests import forked
 from tests.system.virtual_stand import VirtualStand, virtual_stand
+from thermostand.foundation.errors import DeviceFault
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 LIMIT_S = 60.0  # real
 MODULE = {"registers": "icpdas-m7024", "unit": 4, "channel": 2, "watchdog_s": 12.0}
@@ -109,7 +109,7 @@ async def test_a_process_that_is_killed_leaves_the_module_at_its_safe_value_afte
     path.write_text(yaml.safe_dump(data))
     (tmp_path / "recipe.yaml").write_text(RECIPE)
     run = ["run", tmp_path / "recipe.yaml", "--config", path, "--out", tmp_path / "out"]
-    process = forked.popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
+    process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
     try:
         async with asyncio.timeout(LIMIT_S):
             while await plant("heater_W") == 0:

@@ -17,18 +17,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.errors import StandError
-from foundation.events import CLOCK_STEP
-from foundation.hub import Hub
-from foundation.items import Item, StepMark
-from recording.reading.session import Session
-from stand.commands.sessions.session_commands import app
-from stand.config.stand_config import StandConfig
-from stand.running.order import Order
-from stand.running.run import run_real
-from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests.system.conftest import FAST, require_aravis
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.events import CLOCK_STEP
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item, StepMark
+from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.sessions.session_commands import app
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_real
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 MOVED = Path(__file__).parent / "moved_clocks"
 COLD = """
@@ -68,7 +68,7 @@ async def test_a_suspend_and_a_step_of_the_system_clock_are_recorded_and_instant
     """The run may go on or trip on readings so old; either way it is recorded in instants that have passed."""
     ordered, host = order(BRIEF, **FAST), MovedTime()
     await asyncio.to_thread(simulator, ordered.config, False)
-    monkeypatch.setattr("foundation.clock.time", host)
+    monkeypatch.setattr("thermostand.foundation.clock.time", host)
 
     def watch(hub: Hub) -> None:
         def move(item: Item) -> None:
@@ -118,7 +118,7 @@ class Host:
 
     @contextlib.contextmanager
     def daemon(self, *command: str) -> Iterator[subprocess.Popen[str]]:
-        words = [sys.executable, "-m", "stand.cli", *(command or ("run", *self._order))]
+        words = [sys.executable, "-m", "thermostand.stand.cli", *(command or ("run", *self._order))]
         environment = {**os.environ, **self._environment, "OPENBLAS_NUM_THREADS": "1"}
         process = subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         try:

@@ -13,8 +13,8 @@ from tests.recording.runs import record_run
 HEAVY = ("numba", "scipy", "cv2", "matplotlib")
 
 WORK = {
-    "stand": "import sys; sys.argv = ['stand', '--help']; from stand.cli import app",
-    "compensate": "import sys; sys.argv = ['compensate', '--help']; from compensation.cli import app",
+    "stand": "import sys; sys.argv = ['stand', '--help']; from thermostand.stand.cli import app",
+    "compensate": "import sys; sys.argv = ['compensate', '--help']; from thermostand.compensation.cli import app",
 }
 
 
@@ -34,15 +34,15 @@ def test_help_loads_no_heavy_library(command: str):
 
 @pytest.mark.parametrize("module", ["foundation.clock", "recording", "markers", "compensation", "experiments", "stand"])
 def test_a_package_loads_no_heavy_library(module: str):
-    assert loaded(f"import {module}") == set()
+    assert loaded(f"import thermostand.{module}") == set()
 
 
 @pytest.mark.parametrize(("recipe", "heavy"), [("demo", set[str]()), ("thermal-cycle-settled", {"numba", "scipy"})])
 def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(recipe: str, heavy: set[str]):
     code = (
-        "import stand.running.run\n"
-        "from stand.running.order import load_order\n"
-        "from stand.running.executing.settling_watch import load_for\n"
+        "import thermostand.stand.running.run\n"
+        "from thermostand.stand.running.order import load_order\n"
+        "from thermostand.stand.running.executing.settling_watch import load_for\n"
         f"load_for(load_order({recipe!r}, 'simulated').recipe.plan())"
     )
     assert loaded(code) - {"cv2"} == heavy  # frames are encoded with OpenCV
@@ -50,10 +50,11 @@ def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(recipe: str,
 
 async def test_reading_a_session_loads_no_heavy_library_until_a_frame_is_decoded(tmp_path: Path):
     night = str(await record_run(tmp_path / "night"))
-    code = f"from recording import Session; s = Session.open({night!r}); s.channels(); s.frames_table(); s.holes"
+    code = f"from thermostand.recording import Session; s = Session.open({night!r}); "
+    code += "s.channels(); s.frames_table(); s.holes"
     assert loaded(code) == set()
     assert loaded(f"{code}; s.frame(0)") == {"cv2"}
 
 
 def test_a_heavy_library_would_be_found():
-    assert loaded("import markers.detection") >= {"numba", "cv2"}
+    assert loaded("import thermostand.markers.detection") >= {"numba", "cv2"}

@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foundation.clock import seconds_ns
-from foundation.errors import ConfigError, StandError, StandTripped
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from foundation.readings import Reading, bad_reading
-from recording.reading.session import Session
-from stand.config.stand_config import load_config, packaged
-from stand.guarding.rules import Announcements, watches
-from stand.running.order import load_order
-from stand.running.run import run_virtual
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import ConfigError, StandError, StandTripped
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.running.order import load_order
+from thermostand.stand.running.run import run_virtual
 
 STEPS = """
 name: rest

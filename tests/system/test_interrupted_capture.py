@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.steps import Capture
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from foundation.readings import Frame
-from recording.format.restarts import begins_of, is_superseded
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.asking import ask
 from tests.recording.disks import limit_files
 from tests.system.conftest import require_aravis
 from tests.system.test_run import fault
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: interrupted

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_session, salvage_unfinished
 from tests.recording.damage import names, read_segment
 from tests.system.recording_process import MESSAGES_PER_ROUND, frame_records, nursery, telemetry_records
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_session, salvage_unfinished
 
 LONGEST_S = 0.5
 

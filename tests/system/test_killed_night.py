@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from stand.running.memory.entries import Ended, Gap, Written
-from stand.running.memory.journal import JOURNAL_NAME
-from stand.running.order import Order
 from tests.journals import read_lines
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import check, check_soaks, revived
+from thermostand.stand.running.memory.entries import Ended, Gap, Written
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
+from thermostand.stand.running.order import Order
 
 LIFE_S = 20.0
 SET_POINTS = [30, 20, 24, 32, 20, 28, 22, 34, 26, 20, 30, 24] * 4

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from experiments.known import Visit
-from experiments.steps import Capture, Decide
-from foundation.clock import WallClock
-from recording.reading.session import Session
-from stand.running.executing.deciding import Decider
-from stand.running.memory.entries import Edited
-from stand.running.order import Order
-from stand.running.run import run_virtual
-from stand.running.session_report import DECIDES
 from tests.journals import read_lines
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from thermostand.experiments.known import Visit
+from thermostand.experiments.steps import Capture, Decide
+from thermostand.foundation.clock import WallClock
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.executing.deciding import Decider
+from thermostand.stand.running.memory.entries import Edited
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
+from thermostand.stand.running.session_report import DECIDES
 
 pytestmark = pytest.mark.nightly
 

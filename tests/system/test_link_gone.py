@@ -12,23 +12,23 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.errors import StandTripped
-from foundation.hub import Hub
-from foundation.items import Event
-from recording.reading.session import Session
-from stand.config.stand_config import packaged
-from stand.daemon.daemon import Daemon
-from stand.daemon.daemon_desk import DaemonDesk
-from stand.daemon.serve import serve
-from stand.running.order import Order
-from stand.running.run import Interrupted, run_virtual
-from stand.serving.desk import RunRequest, Who
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, check_safe
 from tests.system.test_run import at_step, fault
 from tests.system.test_run_ends import break_now
 from tests.system.test_unrecorded_heat import SOAK, heater_is, plant
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.errors import StandTripped
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.daemon.daemon import Daemon
+from thermostand.stand.daemon.daemon_desk import DaemonDesk
+from thermostand.stand.daemon.serve import serve
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import Interrupted, run_virtual
+from thermostand.stand.serving.desk import RunRequest, Who
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
 QUICK = {"timeout_s": 0.1}
@@ -135,8 +135,8 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
     """A minute, here a tenth of a second."""
     ordered = order(SOAK, **FAST | {"bus": QUICK})
     await asyncio.to_thread(simulator, ordered.config, False)
-    monkeypatch.setattr("stand.safety._GIVEN_UP_AFTER_S", 0.1)
-    monkeypatch.setattr("stand.daemon.daemon._LOOK_S", 0.2)
+    monkeypatch.setattr("thermostand.stand.safety._GIVEN_UP_AFTER_S", 0.1)
+    monkeypatch.setattr("thermostand.stand.daemon.daemon._LOOK_S", 0.2)
     text = (tmp_path / "config.yaml").read_text()
     texts = {"config.yaml": text, "target.yaml": packaged("targets", ordered.config.target).read_text()}
     watcher = Watcher()
@@ -174,7 +174,10 @@ async def test_as_a_command_in_real_time_it_ends_with_that_word_and_its_exit_cod
     await asyncio.to_thread(simulator, ordered.config, False)
     run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "config.yaml", "--out", tmp_path / "out"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "thermostand.stand.cli", *run],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         async with asyncio.timeout(LIMIT_S):

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from compensation.drift.evaluation import Evaluation
-from compensation.reporting.report import analyse
-from foundation.progress import progress
-from stand.config.stand_config import packaged
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
+from thermostand.compensation.drift.evaluation import Evaluation
+from thermostand.compensation.reporting.report import analyse
+from thermostand.foundation.progress import progress
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 

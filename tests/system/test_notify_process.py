@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import WallClock
-from stand.guarding.notify import Notifier
+from thermostand.foundation.clock import WallClock
+from thermostand.stand.guarding.notify import Notifier
 
 LIMIT_S = 60.0  # for what takes milliseconds, on a machine that has other things to do
 

@@ -9,20 +9,20 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError, StandError
-from foundation.hub import Hub
-from foundation.items import Event, Item, StepMark, StepState
-from recording.reading.session import Session
-from stand.running.memory.entries import Held
-from stand.running.memory.journal import JOURNAL_NAME
-from stand.running.order import Order
-from stand.running.run import Interrupted, run_virtual
 from tests.asking import ask, ask_status
 from tests.journals import read_lines
 from tests.system.conftest import require_aravis
 from tests.system.test_attended import PROMPTED
 from tests.system.test_guard_run import check_safe
 from tests.system.test_resume import NIGHT, check, check_soaks
+from thermostand.foundation.errors import SessionError, StandError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.memory.entries import Held
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import Interrupted, run_virtual
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 

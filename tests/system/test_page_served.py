@@ -33,7 +33,7 @@ class ServedPage(Served):
     def __init__(self, config_file, out, port):
         self.out = out
         arguments = ["serve", str(config_file), "--out", str(out), "--port", str(port)]
-        command = [sys.executable, "-m", "stand.cli", *arguments]
+        command = [sys.executable, "-m", "thermostand.stand.cli", *arguments]
         self.process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

@@ -5,18 +5,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from recording.reading.session import Session
-from stand.assembly import Assembly
-from stand.running.memory.fold import fold
-from stand.running.memory.journal import Logbook
-from stand.running.opening.stop import Stop
-from stand.running.order import Order
-from stand.running.run_desk import RunDesk
-from stand.serving.desk import Who
 from tests.asking import ask
 from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of
+from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly import Assembly
+from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.memory.journal import Logbook
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run_desk import RunDesk
+from thermostand.stand.serving.desk import Who
 
 
 def desk_of(assembly: Assembly) -> RunDesk:

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import Capture, CloseFlap, OpenFlap, Role, SetTemperature, Soak, StopChamber
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from foundation.items import Item, StepMark, StepState
-from recording.reading.overview import overview
-from recording.reading.run_word import Files, Run
-from recording.reading.session import Session
-from recording.repair.verify import verify
-from stand.running.executing.executor import Executor
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import Interrupted, resume, run_virtual
 from tests.asking import ask
 from tests.system.conftest import SHORT_RECIPE, require_aravis
+from thermostand.experiments.steps import Capture, CloseFlap, OpenFlap, Role, SetTemperature, Soak, StopChamber
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item, StepMark, StepState
+from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.verify import verify
+from thermostand.stand.running.executing.executor import Executor
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import Interrupted, resume, run_virtual
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
 
@@ -40,7 +40,7 @@ def executors(monkeypatch: pytest.MonkeyPatch) -> list[Executor]:
             super().__init__(*args, **options)
             found.append(self)
 
-    monkeypatch.setattr("stand.running.guest.Executor", Kept)
+    monkeypatch.setattr("thermostand.stand.running.guest.Executor", Kept)
     return found
 
 

@@ -12,11 +12,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from recording.format.layout import FRAMES, TELEMETRY
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_unfinished
 from tests.system.recording_process import frame_records, nursery, telemetry_records
 from tests.system.test_kill_recording import read_series
+from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_unfinished
 
 CUTS = 12
 MOST_CUTS = 3 * CUTS

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from recording.reading.session import Session
-from stand.config.stand_config import StandConfig, packaged
-from stand.running.order import Order
-from stand.running.run import run_virtual
-from stand.simulator import Simulator
 from tests.nightly import by_night
 from tests.stand.guarded_recipes import RECIPES
 from tests.system.conftest import AS_INSTALLED, CORNER, WHOLE_SENSOR, require_aravis
 from tests.system.test_guard_wire import Bench, bench_of
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
+from thermostand.stand.simulator import Simulator
 
 POLLED = AS_INSTALLED
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import yaml
 
-from compensation.observations import Observations, observe
-from experiments.steps import Role
-from foundation.documents import parse_document
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
-from stand.running.order import Order
-from stand.running.run import run_virtual
+from thermostand.compensation.observations import Observations, observe
+from thermostand.experiments.steps import Role
+from thermostand.foundation.documents import parse_document
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 from .conftest import require_aravis
 

@@ -7,15 +7,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.steps import Capture
-from foundation.items import StepState
-from recording.reading.session import Session
-from stand.estimating.learned import load_learned
-from stand.queueing import queue
-from stand.queueing.queue_work import MOST_FRUITLESS_STARTS
-from stand.running.order import load_order
 from tests import forked
 from tests.system.conftest import require_aravis
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.items import StepState
+from thermostand.recording.reading.session import Session
+from thermostand.stand.estimating.learned import load_learned
+from thermostand.stand.queueing import queue
+from thermostand.stand.queueing.queue_work import MOST_FRUITLESS_STARTS
+from thermostand.stand.running.order import load_order
 
 RECIPE = """
 name: queued
@@ -33,7 +33,7 @@ experiments:
 COMMAND = [
     sys.executable,
     "-m",
-    "stand.cli",
+    "thermostand.stand.cli",
     "queue",
     "start",
     "--virtual-time",
@@ -109,6 +109,6 @@ def test_a_run_that_dies_whenever_it_goes_on_makes_way_for_the_next(tmp_path: Pa
     assert (first.state, second.state) == ("failed", "done")
     assert first.reason.startswith("its daemon was killed 3 times in a row before one more step was done")
     assert Session.open(out / second.session).frame_count == 4
-    resumed = [sys.executable, "-m", "stand.cli", "resume", str(out / first.session)]
+    resumed = [sys.executable, "-m", "thermostand.stand.cli", "resume", str(out / first.session)]
     assert forked.run(resumed, capture_output=True, timeout=300).returncode == 0
     assert Session.open(out / first.session).frame_count == 4

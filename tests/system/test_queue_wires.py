@@ -9,19 +9,19 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from foundation.addresses import tcp_place
-from foundation.clock import WallClock
-from foundation.hub import Hub
-from stand.assembly import assemble
-from stand.commands.queue_cli import app
-from stand.config.stand_config import load_config, packaged
-from stand.queueing.queue import queued
-from stand.running.opening.claim import claimed
-from stand.running.order import Order
-from stand.simulator import Simulator
 from tests.addresses import free_port
 from tests.system.conftest import AS_INSTALLED, require_aravis
 from tests.system.gateway import Gateway
+from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import assemble
+from thermostand.stand.commands.queue_cli import app
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.queueing.queue import queued
+from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.order import Order
+from thermostand.stand.simulator import Simulator
 
 POLLED = AS_INSTALLED
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from compensation.cli import app as compensate
-from stand.commands.command_table import app as stand
 from tests.compensation.rendered import Scene, photograph, render
 from tests.system.conftest import require_aravis
 from tests.system.test_validation_nightly import VALIDATION
+from thermostand.compensation.cli import app as compensate
+from thermostand.stand.commands.command_table import app as stand
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.errors import Unreachable
-from foundation.hub import Hub
-from foundation.items import Item, StepMark
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import Interrupted, run_real
-from stand.simulator import ControlSocket
 from tests.addresses import camera_address
 from tests.system.conftest import CORNER, FAST, require_aravis
+from thermostand.foundation.errors import Unreachable
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item, StepMark
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import Interrupted, run_real
+from thermostand.stand.simulator import ControlSocket
 
 BRIEF = """
 name: brief
@@ -98,7 +98,7 @@ async def test_a_simulated_laboratory_that_is_ended_leaves_nothing_behind(
     """Also when other threads, here those of OpenBLAS, could be handed the signal."""
     ordered = order(BRIEF)
     command = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "stand.cli", "simulate", str(tmp_path / "config.yaml")),
+        *(sys.executable, "-m", "thermostand.stand.cli", "simulate", str(tmp_path / "config.yaml")),
         stderr=asyncio.subprocess.PIPE,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "4"},
     )

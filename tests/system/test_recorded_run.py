@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.observations import observe_session, session_target
-from foundation.hub import Hub
-from foundation.items import Event
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from thermostand.compensation.observations import observe_session, session_target
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: short

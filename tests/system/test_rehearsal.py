@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foundation.errors import ConfigError
-from recording.reading.run_word import Run
-from recording.reading.session import Session
-from stand.config.stand_config import StandConfig, packaged
-from stand.running.order import load_order
-from stand.running.rehearsal import rehearsed
-from stand.running.run import run_virtual
+from thermostand.foundation.errors import ConfigError
+from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.running.order import load_order
+from thermostand.stand.running.rehearsal import rehearsed
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = "name: short\nsteps:\n  - start_chamber: 26\n  - soak: 300\n  - stop_chamber\n"
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from foundation.clock import seconds_ns
-from foundation.errors import DeviceFault, Unreachable
-from foundation.hub import Hub
-from stand.assembly import Assembly, assemble
-from stand.imaging.camera_opening import CameraOpening
-from stand.running.order import Order
 from tests.system.conftest import AS_INSTALLED
 from tests.system.test_guard_wire import Bench, Start, bench_of, write_by_another_master
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import DeviceFault, Unreachable
+from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.imaging.camera_opening import CameraOpening
+from thermostand.stand.running.order import Order
 
 POLLED = AS_INSTALLED
 

@@ -10,17 +10,17 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from compensation.drift.model_file import load_model
-from foundation.exit_codes import NOT_REPORTED
-from recording.reading.session import Session
-from recording.repair.verify import verify
-from stand.commands.command_table import app
-from stand.config.stand_config import packaged
-from stand.estimating.estimate import price
-from stand.running.order import load_order
-from stand.running.session_report import MODEL_NAME, REPORT_NAME
 from tests import forked
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from thermostand.compensation.drift.model_file import load_model
+from thermostand.foundation.exit_codes import NOT_REPORTED
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.verify import verify
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.estimating.estimate import price
+from thermostand.stand.running.order import load_order
+from thermostand.stand.running.session_report import MODEL_NAME, REPORT_NAME
 
 NIGHT = """
 name: a-night
@@ -100,7 +100,7 @@ def out(tmp_path: Path) -> Iterator[Path]:
 def run_reported(recipe: str, config_text: str, out: Path, timeout_s: float) -> subprocess.CompletedProcess[str]:
     config = out.parent / "stand.yaml"
     config.write_text(config_text)
-    command = [sys.executable, "-m", "stand.cli", "run", recipe, "--config", str(config), "--out", str(out)]
+    command = [sys.executable, "-m", "thermostand.stand.cli", "run", recipe, "--config", str(config), "--out", str(out)]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     options = ["--virtual-time", "--report"]
     return forked.run([*command, *options], capture_output=True, text=True, env=environment, timeout=timeout_s)

@@ -11,26 +11,26 @@ from pathlib import Path
 
 import pytest
 
-from experiments.steps import Capture
-from foundation.errors import SessionError, StandTripped, Unreachable
-from foundation.hub import Hub
-from foundation.items import StepState
-from recording.format.restarts import begins_of, is_superseded
-from recording.reading.glance import glance
-from recording.reading.run_word import Files, Run
-from recording.reading.session import Session
-from recording.repair.verify import verify
-from stand.running.memory.entries import Dwell, Gap, Step
-from stand.running.memory.journal import JOURNAL_NAME
-from stand.running.order import Order
-from stand.running.resume import Interruption, interruption
-from stand.running.run import Interrupted, resume, run_virtual
-from stand.simulator import ControlSocket
 from tests.asking import ask, ask_status
 from tests.journals import lines_with, read_lines
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_run import at_step, fault
+from thermostand.experiments.steps import Capture
+from thermostand.foundation.errors import SessionError, StandTripped, Unreachable
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import StepState
+from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.reading.glance import glance
+from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.verify import verify
+from thermostand.stand.running.memory.entries import Dwell, Gap, Step
+from thermostand.stand.running.memory.journal import JOURNAL_NAME
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import Interruption, interruption
+from thermostand.stand.running.run import Interrupted, resume, run_virtual
+from thermostand.stand.simulator import ControlSocket
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")
 ITEMS_PER_LIFE = 400  # about a set-point's worth: with fewer the night would hardly get on

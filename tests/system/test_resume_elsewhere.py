@@ -11,22 +11,22 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from drivers.wires.camera_settings import TemperatureFeature
-from foundation.errors import ConfigError, StandTripped
-from foundation.sealed import seal
-from recording.reading.session import Session
-from stand.commands.command_table import app
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.queueing.queue_file import QUEUE_NAME
-from stand.running.opening.own_stand import on_this_stand
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import Interrupted, resume, run_real, run_virtual
 from tests.sections import change
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF
 from tests.system.test_resume import findable
 from tests.system.test_run import at_step, fault
+from thermostand.drivers.wires.camera_settings import TemperatureFeature
+from thermostand.foundation.errors import ConfigError, StandTripped
+from thermostand.foundation.sealed import seal
+from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.queueing.queue_file import QUEUE_NAME
+from thermostand.stand.running.opening.own_stand import on_this_stand
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import Interrupted, resume, run_real, run_virtual
 
 CAPTURES = """
 name: captures
@@ -171,7 +171,7 @@ def test_a_simulated_session_never_reaches_a_real_flap_or_file(tmp_path: Path):
         tmp_path, "simulated", flap={"backend": "somebodys.module"}, relays={"registers": "/tmp/somebody.yaml"}
     )
     config, differences = on_this_stand(session, config_of(tmp_path), tmp_path, is_virtual=True)
-    assert config.flap.backend == "drivers.sim.usb"
+    assert config.flap.backend == "thermostand.drivers.sim.usb"
     assert config.relays.registers == "waveshare-relay"
     assert {difference.path for difference in differences} == {"relays.registers", "flap.backend"}
 

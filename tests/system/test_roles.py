@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 import yaml
 
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.guarding.rules import vital
 from tests.system.virtual_stand import virtual_stand
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.guarding.rules import vital
 
 THERMOMETERS: dict[str, dict[str, Any]] = {
     "base_plate": {"channel": 0, "role": "granite_inside", "certificate": "T-17"},

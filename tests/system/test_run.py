@@ -16,16 +16,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.errors import ConfigError, SessionError, StandError, StandTripped, Unreachable
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepMark, StepState
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import Interrupted, run_virtual
-from stand.simulator import ControlSocket
 from tests import forked
 from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE, WHOLE_SENSOR, require_aravis
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.errors import ConfigError, SessionError, StandError, StandTripped, Unreachable
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import Interrupted, run_virtual
+from thermostand.stand.simulator import ControlSocket
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 
@@ -146,8 +146,8 @@ async def test_a_lost_safety_sensor_makes_the_stand_safe_and_ends_the_run(
 DAEMON = """
 import asyncio, pickle, sys
 from pathlib import Path
-from foundation.items import Batch
-from stand.running.run import run_virtual
+from thermostand.foundation.items import Batch
+from thermostand.stand.running.run import run_virtual
 
 order, out = pickle.loads(sys.stdin.buffer.read())
 

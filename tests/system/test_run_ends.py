@@ -16,19 +16,19 @@ from types import FrameType
 
 import pytest
 
-from foundation import calls
-from foundation.errors import NotCleared, StandTripped
-from foundation.items import Item, StepMark, StepState
-from recording.reading.session import Session
-from stand.config.stand_config import StandConfig
-from stand.running.order import Order
-from stand.running.run import Interrupted, run_real, run_virtual
-from stand.simulator import Simulator
 from tests.system.conftest import SHORT_RECIPE, require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import telling
 from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, ignore
+from thermostand.foundation import calls
+from thermostand.foundation.errors import NotCleared, StandTripped
+from thermostand.foundation.items import Item, StepMark, StepState
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import Interrupted, run_real, run_virtual
+from thermostand.stand.simulator import Simulator
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
 
@@ -52,7 +52,7 @@ async def test_a_session_says_which_package_has_made_steps_of_its_plan(
     tmp_path: Path, order: Callable[..., Order], monkeypatch: pytest.MonkeyPatch
 ):
     (tmp_path / "acme.py").write_text(
-        "from experiments.steps import CloseFlap\nfrom pydantic import BaseModel\n"
+        "from thermostand.experiments.steps import CloseFlap\nfrom pydantic import BaseModel\n"
         "class P(BaseModel): pass\ndef shut(p: P): yield CloseFlap()\n"
     )
     info = tmp_path / "acme-1.2.dist-info"

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import observe
-from experiments.steps import Role
-from foundation.items import Event, StepMark, StepState
-from foundation.progress import progress
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from thermostand.compensation.observations import observe
+from thermostand.experiments.steps import Role
+from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.foundation.progress import progress
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: sequences

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from recording.writing.disk import MODULE
-from stand.running.opening.writer_restarts import MOST_PER_H
-from stand.running.order import Order
-from stand.serving.desk import StandState
 from tests.recording.disks import ext4, run
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_daemon import LIMIT_S, Served, is_idle
 from tests.system.test_unrecorded_heat import SOAK
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.writing.disk import MODULE
+from thermostand.stand.running.opening.writer_restarts import MOST_PER_H
+from thermostand.stand.running.order import Order
+from thermostand.stand.serving.desk import StandState
 
 LEAVES_WITHIN_S = 8.0  # 5 s on an idle machine; the waits take 3.6 s (tests/stand/test_leaving.py)
 STOPPED_S = 1.5  # 6 periods of the guard

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from compensation.observations import Observations, observe
-from experiments.steps import Role
-from foundation.clock import NS_PER_S
-from foundation.items import StepState
-from foundation.progress import progress
-from recording.reading.session import Session
-from stand.running.memory.entries import Dwell
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.journals import read_lines
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from thermostand.compensation.observations import Observations, observe
+from thermostand.experiments.steps import Role
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.items import StepState
+from thermostand.foundation.progress import progress
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.memory.entries import Dwell
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: settled

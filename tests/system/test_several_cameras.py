@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 import yaml
 
-from compensation.observations import observe
-from foundation.documents import parse_document
-from recording.reading.session import Session
-from recording.repair.verify import Files, verify
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.opening.stop import Interrupted
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import resume, run_virtual
 from tests.dialects import DIALECTS
 from tests.sections import change
+from thermostand.compensation.observations import observe
+from thermostand.foundation.documents import parse_document
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.verify import Files, verify
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.running.opening.stop import Interrupted
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import resume, run_virtual
 
 from .conftest import CALM, require_aravis
 from .test_run import at_step

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.sim.gige.switch import Switch
-from foundation.clock import WallClock, seconds_ns
-from foundation.hub import Hub
-from foundation.readings import Frame
-from stand.assembly import assemble
-from stand.config.stand_config import StandConfig
-from stand.simulator import Simulator, laboratory_of, relocated
 from tests.system.conftest import require_aravis
 from tests.system.test_several_cameras import simulated
+from thermostand.drivers.sim.gige.switch import Switch
+from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Frame
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.simulator import Simulator, laboratory_of, relocated
 
 
 def test_what_a_switch_cannot_hold_is_lost():

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from recording.reading.session import Session
-from stand.config.stand_config import packaged
 from tests import forked
 from tests.sections import change
 from tests.system.conftest import CALM, CORNER, SHORT_RECIPE, require_aravis
 from tests.system.test_run import digests
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import packaged
 
 # A night as short as it can be.
 RECIPE = (
@@ -21,7 +21,7 @@ RECIPE = (
     .replace("[20]", "[]")
     .replace("frames: 2", "frames: 1")
 )
-STAND = [sys.executable, "-m", "stand.cli"]
+STAND = [sys.executable, "-m", "thermostand.stand.cli"]
 
 
 @pytest.fixture(autouse=True)

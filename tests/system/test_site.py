@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from stand.config.reference import reference
+from thermostand.stand.config.reference import reference
 
 ROOT = Path(__file__).parents[2]
 

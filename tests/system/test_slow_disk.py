@@ -7,13 +7,13 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.hub import Hub
-from foundation.items import Batch, Event
-from foundation.readings import Frame, Reading
-from recording.reading.session import Session
-from recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from tests.recording.disks import ext4, run
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings(

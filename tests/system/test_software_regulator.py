@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivers.devices.regulators.pid import Law
-from drivers.devices.regulators.software_regulator import SoftwareRegulator
-from foundation.errors import DeviceFault, Occupied, Refused
-from stand.daemon.by_hand import ByHand
-from stand.simulator import ControlSocket, Simulator, laboratory_of
 from tests import forked
 from tests.system.regulator_steps import steps_of, tuned_in
 from tests.system.virtual_stand import VirtualStand, bare_config, virtual_stand
+from thermostand.drivers.devices.regulators.pid import Law
+from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
+from thermostand.foundation.errors import DeviceFault, Occupied, Refused
+from thermostand.stand.daemon.by_hand import ByHand
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 LIMIT_S = 60.0  # real, for what takes a few seconds on a machine that has other things to do
 RELAYS, HEAT = 2, 3  # unit, its relay
@@ -200,7 +200,7 @@ async def test_a_process_that_is_stopped_gives_no_heat_after_its_last_pulse(tmp_
     (tmp_path / "stand.yaml").write_text(yaml.safe_dump(data))
     (tmp_path / "recipe.yaml").write_text(RECIPE)
     run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "stand.yaml", "--out", tmp_path / "out"]
-    process = forked.popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
+    process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
     try:
         async with asyncio.timeout(LIMIT_S):
             while await plant("heater_W") == 0:

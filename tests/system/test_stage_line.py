@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
-from foundation.readings import Quality
+from thermostand.foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
+from thermostand.foundation.readings import Quality
 
 from .stage_bench import Bench, Tap, running_bench
 

@@ -8,25 +8,25 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.cameras.camera_gige import Camera
-from drivers.devices.motion.flap import Flap
-from drivers.devices.motion.stage import Axis, AxisSettings
-from drivers.devices.regulators.regulator import Regulator
-from drivers.devices.relays import Relays
-from drivers.devices.thermometers import Thermometers
-from drivers.wires.bus import Bus, BusSettings
-from drivers.wires.camera_settings import GigeCameraSettings
-from drivers.wires.registers import load_register_map
-from foundation.clock import Clock, WallClock, seconds_ns
-from foundation.errors import DeviceFault, Refused, Superseded
-from foundation.hub import Hub
-from stand.chamber.chamber import ChamberLimits
-from stand.chamber.permits import PermitLimits
-from stand.config.stand_config import CompressorConfig, packaged
-from stand.gate import INTERLOCK
-from stand.imaging.camera_supply import SupplyLimits
-from stand.interlock import Interlocked
-from stand.stand import Devices, Stand
+from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.motion.flap import Flap
+from thermostand.drivers.devices.motion.stage import Axis, AxisSettings
+from thermostand.drivers.devices.regulators.regulator import Regulator
+from thermostand.drivers.devices.relays import Relays
+from thermostand.drivers.devices.thermometers import Thermometers
+from thermostand.drivers.wires.bus import Bus, BusSettings
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings
+from thermostand.drivers.wires.registers import load_register_map
+from thermostand.foundation.clock import Clock, WallClock, seconds_ns
+from thermostand.foundation.errors import DeviceFault, Refused, Superseded
+from thermostand.foundation.hub import Hub
+from thermostand.stand.chamber.chamber import ChamberLimits
+from thermostand.stand.chamber.permits import PermitLimits
+from thermostand.stand.config.stand_config import CompressorConfig, packaged
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.imaging.camera_supply import SupplyLimits
+from thermostand.stand.interlock import Interlocked
+from thermostand.stand.stand import Devices, Stand
 
 from .flap_bench import SETTINGS as FLAP
 from .stage_bench import SERIAL_NUMBER, Bench, running_bench

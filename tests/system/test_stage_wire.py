@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.motion.stage import AxisSettings
-from foundation.clock import seconds_ns
-from foundation.errors import DeviceFault, Refused
-from foundation.readings import Quality, Reading
+from thermostand.drivers.devices.motion.stage import AxisSettings
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import DeviceFault, Refused
+from thermostand.foundation.readings import Quality, Reading
 
 from .stage_bench import OVERSHOOT, START_STEPS, UNIT_PER_STEP, Bench, Kind, running_bench
 

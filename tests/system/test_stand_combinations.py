@@ -14,21 +14,21 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from compensation.cli import app as compensate
-from foundation.clock import VirtualClock
-from foundation.documents import parse_document
-from foundation.errors import ConfigError
-from foundation.hub import Hub
-from recording.reading.session import Session
-from stand.assembly import assemble
-from stand.config.recipe import Recipe
-from stand.config.stand_config import StandConfig, packaged
-from stand.daemon.hands_on import known_devices
-from stand.estimating.absent import absences
-from stand.running.order import Order, check_plan
-from stand.running.run import run_virtual
-from stand.simulator import laboratory_of
 from tests.system.conftest import require_aravis
+from thermostand.compensation.cli import app as compensate
+from thermostand.foundation.clock import VirtualClock
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.daemon.hands_on import known_devices
+from thermostand.stand.estimating.absent import absences
+from thermostand.stand.running.order import Order, check_plan
+from thermostand.stand.running.run import run_virtual
+from thermostand.stand.simulator import laboratory_of
 
 Data = dict[str, Any]
 SIMULATED: Data = yaml.safe_load(packaged("", "simulated").read_text())

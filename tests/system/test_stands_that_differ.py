@@ -7,15 +7,15 @@ from typing import Any
 import pytest
 import yaml
 
-from foundation.documents import load_document
-from foundation.errors import ConfigError
-from recording.reading.session import Session
-from stand.config.recipe import Recipe
-from stand.config.stand_config import load_config, packaged
-from stand.estimating.absent import absences
-from stand.running.order import Order, check_plan
-from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
+from thermostand.foundation.documents import load_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.estimating.absent import absences
+from thermostand.stand.running.order import Order, check_plan
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: short

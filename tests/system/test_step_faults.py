@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from foundation.clock import NS_PER_S, seconds_ns
-from foundation.exit_codes import FAILED, NOT_CLEARED
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from foundation.tasks import cancelled
-from recording.reading.session import Session
-from stand.commands.command_table import app
-from stand.gate import INTERLOCK
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.asking import ask
 from tests.system.conftest import require_aravis
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.exit_codes import FAILED, NOT_CLEARED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.foundation.tasks import cancelled
+from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.command_table import app
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 RECIPE = """
 name: two-places

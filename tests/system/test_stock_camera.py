@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.devices.cameras.cameras_by_protocol import make_camera
-from foundation.clock import WallClock
-from stand.config.stand_config import load_config
 from tests.stock_camera import ADDRESS, SERIAL
+from thermostand.drivers.devices.cameras.cameras_by_protocol import make_camera
+from thermostand.foundation.clock import WallClock
+from thermostand.stand.config.stand_config import load_config
 
 
 @pytest.mark.usefixtures("stock_camera")

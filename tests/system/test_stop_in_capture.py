@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from foundation.hub import Hub
-from foundation.items import Item
-from foundation.readings import Frame
-from recording.reading.session import Session
-from stand.running.order import Order
-from stand.running.run import Interrupted, run_virtual
 from tests.system.conftest import SHORT_RECIPE, require_aravis
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Item
+from thermostand.foundation.readings import Frame
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import Interrupted, run_virtual
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
 SEVERAL = SHORTER.replace("reference_frames: 2", "reference_frames: 5")

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from recording.reading.session import Session
-from stand.running.order import Order
 from tests import forked
 from tests.system.conftest import FAST, require_aravis
 from tests.system.gateway import gateway
 from tests.system.test_unrecorded_heat import SOAK, heater_is, plant
+from thermostand.recording.reading.session import Session
+from thermostand.stand.running.order import Order
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
 STOPPED_S = 1.5  # 6 periods of the guard, and less than the camera waits for its client
@@ -46,7 +46,7 @@ async def test_after_a_stop_heat_waits_for_readings_taken_since(
         config["bus"]["address"] = through.config.bus.address
         (tmp_path / "through.yaml").write_text(yaml.safe_dump(config))
         run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "through.yaml", "--out", tmp_path / "out"]
-        process = forked.popen([sys.executable, "-m", "stand.cli", *run], stdout=subprocess.DEVNULL)
+        process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
         asked, answered = list[bytes](), list[bytes]()
 
         def loses(request: bytes) -> bool:

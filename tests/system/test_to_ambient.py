@@ -12,18 +12,18 @@ from typing import Any
 import pytest
 import yaml
 
-from foundation.errors import SessionError, StandTripped
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepState
-from recording.reading.run_word import Run
-from recording.reading.session import Session
-from stand.config.stand_config import packaged
-from stand.running.order import Order, load_order
-from stand.running.resume import interruption
-from stand.running.run import Interrupted, resume, run_virtual
 from tests.addresses import move_to_free
 from tests.asking import ask
 from tests.system.test_run import fault
+from thermostand.foundation.errors import SessionError, StandTripped
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item, StepState
+from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.session import Session
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.running.order import Order, load_order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import Interrupted, resume, run_virtual
 
 RECIPE = "name: away\nsteps:\n  - start_chamber: {set_point}\n  - soak: {soak_s}\n  - stop_chamber\n"
 

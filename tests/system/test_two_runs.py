@@ -12,16 +12,16 @@ from pathlib import Path
 
 import pytest
 
-from foundation.errors import SessionError
-from stand.config.stand_config import load_config
-from stand.running.order import Order
-from stand.serving.client import running_sessions
-from stand.simulator import ControlSocket
 from tests import forked
 from tests.asking import ask_status
 from tests.stand.test_listening import connected
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF
+from thermostand.foundation.errors import SessionError
+from thermostand.stand.config.stand_config import load_config
+from thermostand.stand.running.order import Order
+from thermostand.stand.serving.client import running_sessions
+from thermostand.stand.simulator import ControlSocket
 
 LIMIT_S = 90.0  # for a busy machine
 LONG = BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600").replace("[26]", "[40]")
@@ -34,7 +34,7 @@ def stand(tmp_path: Path) -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
     started: list[subprocess.Popen[str]] = []
 
     def start(*arguments: str | Path) -> "subprocess.Popen[str]":
-        command = [sys.executable, "-m", "stand.cli", *arguments]
+        command = [sys.executable, "-m", "thermostand.stand.cli", *arguments]
         started.append(forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         return started[-1]
 

@@ -11,22 +11,22 @@ from pathlib import Path
 
 import pytest
 
-from foundation.clock import NS_PER_S, WallClock
-from foundation.errors import StandError, StandTripped
-from recording.reading.session import Session
-from recording.repair.salvage import salvage_session
-from recording.writing.disk import MODULE
-from stand.running.opening.writer_restarts import MOST_PER_H
-from stand.running.order import Order
-from stand.running.resume import interruption
-from stand.running.run import run_real
-from stand.simulator import ControlSocket
 from tests.asking import ask, ask_status
 from tests.recording.disks import ext4
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_disk_process import frozen, gone
 from tests.system.test_guard_run import Watcher, telling
 from tests.system.test_run import at_step
+from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.errors import StandError, StandTripped
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_session
+from thermostand.recording.writing.disk import MODULE
+from thermostand.stand.running.opening.writer_restarts import MOST_PER_H
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.run import run_real
+from thermostand.stand.simulator import ControlSocket
 
 SOAK = """
 name: soak

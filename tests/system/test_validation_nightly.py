@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from compensation import cli
-from stand.running.order import Order
-from stand.running.run import run_virtual
 from tests.system.conftest import require_aravis
+from thermostand.compensation import cli
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 

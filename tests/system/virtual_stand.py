@@ -10,15 +10,15 @@ from pathlib import Path
 
 import yaml
 
-from foundation.clock import VirtualClock, seconds_ns
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item
-from stand.assembly import Assembly, assemble
-from stand.config.stand_config import StandConfig, load_config, packaged
-from stand.running.opening.open_stand import OpenStand, opened
-from stand.running.opening.stop import Stop
-from stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 from tests.sections import change
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.running.opening.open_stand import OpenStand, opened
+from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
 
 @dataclass

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from drivers.sim.laboratory_faults import FAULTS
+from thermostand.drivers.sim.laboratory_faults import FAULTS
 
 START_NS = 1_767_290_400_000_000_000  # 2026-01-01 18:00 UTC, as the installed simulated stand has it
 LASTS_S = (5.0, 20.0, 60.0, 300.0, 1800.0)  # of faults

@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, get_args
 
-from drivers.sim.laboratory_faults import FAULTS
-from foundation.events import GUARD
-from stand.running.memory.entries import Written
-from stand.watching.remedies import rows
 from tests.torture.case import KINDS, ORDERS
 from tests.torture.real import KINDS as REAL
 from tests.torture.rig import Result
+from thermostand.drivers.sim.laboratory_faults import FAULTS
+from thermostand.foundation.events import GUARD
+from thermostand.stand.running.memory.entries import Written
+from thermostand.stand.watching.remedies import rows
 
 SITUATIONS = ("between", "soak", "capture", "step", "held", "tripped", "ended")
 """Of a run, as its journal shows them: what is under way, or why nothing is."""

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from foundation.errors import StandError
-from stand.serving.client import Server
 from tests.torture.case import Case, Order
+from thermostand.foundation.errors import StandError
+from thermostand.stand.serving.client import Server
 
 _DOOR_S = 20.0  # of the host
 

@@ -19,12 +19,12 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from foundation.clock import seconds_ns
 from tests import forked
 from tests.torture.case import Case
 from tests.torture.laboratory import TRUTH
 from tests.torture.lives import COMPLETE, KILLED, ROOT, Life
 from tests.torture.real import KINDS as REAL
+from thermostand.foundation.clock import seconds_ns
 
 ROW = np.dtype([("time_ns", "<i8"), *((name, "<f8") for name in TRUTH)])
 
@@ -94,7 +94,7 @@ class Evidence:
             for found in (self.unreadable, self.said, self.marks, self.frames, self.metas, self.temperatures):
                 found.clear()
             for session in self.sessions:
-                program = [sys.executable, "-m", "stand.cli", "session", "salvage", str(session)]
+                program = [sys.executable, "-m", "thermostand.stand.cli", "session", "salvage", str(session)]
                 forked.run(program, cwd=ROOT, capture_output=True)
             self._read_all()
 

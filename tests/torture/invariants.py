@@ -384,7 +384,7 @@ def verify_finds_what_is_lost_and_nothing_else(evidence: Evidence) -> Iterator[s
     """Of a run that is complete nothing is damaged, and what is missing has an event that says so."""
     if not evidence.is_complete:
         return
-    program = [sys.executable, "-m", "stand.cli", "session", "verify", "--json", str(evidence.session)]
+    program = [sys.executable, "-m", "thermostand.stand.cli", "session", "verify", "--json", str(evidence.session)]
     ended = forked.run(program, cwd=ROOT, capture_output=True, text=True)
     try:
         found = json.loads(ended.stdout)

@@ -16,15 +16,15 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from drivers.sim.control import serve_control
-from drivers.sim.fault_schedule import FaultSchedule, PlannedFault
-from drivers.sim.laboratory import Laboratory
-from drivers.sim.laboratory_spec import LaboratorySpec
-from foundation.clock import seconds_ns
-from foundation.documents import parse_document
-from foundation.ending import Ending
-from foundation.errors import ConfigError
 from tests.torture.case import Case, Fault, read_case
+from thermostand.drivers.sim.control import serve_control
+from thermostand.drivers.sim.fault_schedule import FaultSchedule, PlannedFault
+from thermostand.drivers.sim.laboratory import Laboratory
+from thermostand.drivers.sim.laboratory_spec import LaboratorySpec
+from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.ending import Ending
+from thermostand.foundation.errors import ConfigError
 
 FOLDER, LIFE = "TORTURE_FOLDER", "TORTURE_LIFE"
 AFTER_S = 90.0

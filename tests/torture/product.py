@@ -20,15 +20,15 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 
-import stand.running.run as run_module
-from foundation.clock import NS_PER_S, VirtualClock, seconds_ns
-from recording.writing import notices
-from stand.serving.client import Server, server_of
-from stand.simulator import Simulator
+import thermostand.stand.running.run as run_module
 from tests.torture.case import Case, Order, read_case
 from tests.torture.doors import Doors
 from tests.torture.laboratory import FOLDER, LIFE
 from tests.torture.lives import HIDDEN, find_folder
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.recording.writing import notices
+from thermostand.stand.serving.client import Server, server_of
+from thermostand.stand.simulator import Simulator
 
 LOOK_EVERY_S, LOOKS = 300.0, 200  # at what HTTP says
 _TASKS = ("TaskStepMethWrapper", "TaskWakeupMethWrapper", "builtin_function_or_method")
@@ -179,7 +179,7 @@ def main() -> None:
         DrawnLoop.seed = case.seed
         asyncio.events.new_event_loop = asyncio.runners.events.new_event_loop = DrawnLoop
     sys.argv = ["stand", *command]
-    from stand.cli import app
+    from thermostand.stand.cli import app
 
     app()
 

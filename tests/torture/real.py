@@ -31,14 +31,6 @@ from typing import Any
 import pytest
 import yaml
 
-from drivers.sim.laboratory_faults import FAULTS
-from foundation.addresses import tcp_place
-from foundation.clock import NS_PER_S, WallClock, seconds_ns
-from foundation.errors import SessionError
-from recording.writing.disk import MODULE
-from stand.config.stand_config import load_config
-from stand.serving.client import Server, server_of
-from stand.simulator import laboratory_of
 from tests import forked
 from tests.addresses import WORKER, camera_address, free_port, move_to_free
 from tests.recording.disks import ext4
@@ -59,6 +51,14 @@ from tests.torture.case import (
 from tests.torture.doors import Doors
 from tests.torture.laboratory import FOLDER, LIFE
 from tests.torture.lives import HIDDEN, ROOT, Life, find_folder
+from thermostand.drivers.sim.laboratory_faults import FAULTS
+from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.writing.disk import MODULE
+from thermostand.stand.config.stand_config import load_config
+from thermostand.stand.serving.client import Server, server_of
+from thermostand.stand.simulator import laboratory_of
 
 BUSY_S = 40.0  # in which things break
 AFTER_S = 7.0
@@ -465,7 +465,7 @@ class Bench:
     def _begin_daemon(self) -> None:
         command = ["serve", str(self._folder / "stand.yaml"), "--out", str(self.disk / "out"), "--no-reports"]
         command += ["--port", str(self.port), "--secop", str(self.secop)]
-        program = [sys.executable, "-X", "faulthandler", "-m", "stand.cli", *command]
+        program = [sys.executable, "-X", "faulthandler", "-m", "thermostand.stand.cli", *command]
         self._said = self._folder / f"said-{self._daemons}.txt"
         self._daemons += 1
         with self._said.open("w") as file:

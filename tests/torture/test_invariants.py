@@ -133,7 +133,7 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "nobody_is_pestered": pester,
     "heat_ends_with_the_program": stop_program,
     "a_stop_is_answered": press_stop,
-    "nothing_is_left": lambda evidence: end(evidence, left=("python -m foundation.helper",)),
+    "nothing_is_left": lambda evidence: end(evidence, left=("python -m thermostand.foundation.helper",)),
 }
 """For each invariant what is changed in the evidence, so that it must be found."""
 

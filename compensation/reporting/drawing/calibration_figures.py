@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from compensation.calibration.adjustment import Adjustment
-from compensation.calibration.calibrate import Calibration
-from compensation.calibration.least_squares import Float
-from compensation.calibration.uncertainty import grid_pixels
-from compensation.reporting.drawing.figures import (
+from thermostand.compensation.calibration.adjustment import Adjustment
+from thermostand.compensation.calibration.calibrate import Calibration
+from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.uncertainty import grid_pixels
+from thermostand.compensation.reporting.drawing.figures import (
     GREY,
     I_COLOUR,
     J_COLOUR,

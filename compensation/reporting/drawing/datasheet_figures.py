@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compensation.datasheet.datasheet import Datasheet
-from compensation.datasheet.motions import UNITS, Visits, Warming
-from compensation.reporting.drawing.figures import (
+from thermostand.compensation.datasheet.datasheet import Datasheet
+from thermostand.compensation.datasheet.motions import UNITS, Visits, Warming
+from thermostand.compensation.reporting.drawing.figures import (
     FULL_WIDTH_IN,
     GREY,
     I_COLOUR,

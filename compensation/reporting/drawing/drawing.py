@@ -17,8 +17,8 @@ from tempfile import TemporaryDirectory
 
 from matplotlib.figure import Figure
 
-from compensation.finding.workers import pool
-from compensation.reporting.drawing.figures import as_svg
+from thermostand.compensation.finding.workers import pool
+from thermostand.compensation.reporting.drawing.figures import as_svg
 
 Named = tuple[Figure, str]
 Draw = Callable[[Sequence[Named]], list[str]]

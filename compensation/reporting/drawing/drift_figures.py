@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compensation.drift.hysteresis import BranchDifference
-from compensation.observations import Float, Observations
-from compensation.reporting.drawing.figures import (
+from thermostand.compensation.drift.hysteresis import BranchDifference
+from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.reporting.drawing.figures import (
     CAMERA_COLOUR,
     COORDINATES,
     FULL_WIDTH_IN,
@@ -22,8 +22,8 @@ from compensation.reporting.drawing.figures import (
     new_figure,
     style,
 )
-from compensation.reporting.tracks import Rows, Visit, WarmUp, mean_over_markers, moved_px, thinned
-from experiments.steps import Role
+from thermostand.compensation.reporting.tracks import Rows, Visit, WarmUp, mean_over_markers, moved_px, thinned
+from thermostand.experiments.steps import Role
 
 CURVE_POINTS = 400
 """Frames of a curve that are drawn; more only make the page larger."""

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.quiver import Quiver
 
-from compensation.observations import Float
+from thermostand.compensation.observations import Float
 
 I_COLOUR, J_COLOUR = "#0072B2", "#D55E00"
 CAMERA_COLOUR, GREY, WARM_UP_COLOUR = "#CC79A7", "#6b6b6b", "#F0E442"

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from compensation.drift.evaluation import Evaluation, improvement_percent
-from compensation.observations import Float, Observations
-from compensation.reporting.drawing.figures import (
+from thermostand.compensation.drift.evaluation import Evaluation, improvement_percent
+from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.reporting.drawing.figures import (
     COORDINATES,
     FULL_WIDTH_IN,
     PALE,
@@ -18,9 +18,9 @@ from compensation.reporting.drawing.figures import (
     new_figure,
     style,
 )
-from compensation.reporting.drawing.path_figures import Paths, temperature_colours, trajectories
-from compensation.reporting.numbers import percent
-from compensation.reporting.tracks import thinned
+from thermostand.compensation.reporting.drawing.path_figures import Paths, temperature_colours, trajectories
+from thermostand.compensation.reporting.numbers import percent
+from thermostand.compensation.reporting.tracks import thinned
 
 _SIGMA_95 = 1.959964
 _MOST_DOTS = 20_000

@@ -13,9 +13,16 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from compensation.observations import Float, Observations
-from compensation.reporting.drawing.figures import FULL_WIDTH_IN, ON_PALE, PALE, image_axes, new_figure, style
-from compensation.reporting.tracks import thinned
+from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.reporting.drawing.figures import (
+    FULL_WIDTH_IN,
+    ON_PALE,
+    PALE,
+    image_axes,
+    new_figure,
+    style,
+)
+from thermostand.compensation.reporting.tracks import thinned
 
 EXAGGERATION = 100
 _PATH_POINTS = 600

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from compensation.reporting.drawing.figures import I_COLOUR, J_COLOUR, new_figure, style
-from compensation.validation3d.deviations import Deviations
-from compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from compensation.validation3d.validate import Validation
+from thermostand.compensation.reporting.drawing.figures import I_COLOUR, J_COLOUR, new_figure, style
+from thermostand.compensation.validation3d.deviations import Deviations
+from thermostand.compensation.validation3d.paper import AFTER_mm, BEFORE_mm
+from thermostand.compensation.validation3d.validate import Validation
 
 AXES = ("X", "Y", "Z")
 _BEFORE, _AFTER = I_COLOUR, J_COLOUR

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from pydantic import Field
 
-from experiments.parameters import Chamber_degC, StillTable, Wait_s
-from experiments.pieces import frames_through_flap, placed
-from experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
+from thermostand.experiments.parameters import Chamber_degC, StillTable, Wait_s
+from thermostand.experiments.pieces import frames_through_flap, placed
+from thermostand.experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
 
 
 class Staircase(StillTable):

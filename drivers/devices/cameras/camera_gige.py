@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from drivers.framing.aravis_library import AravisError
-from drivers.settings import Identity
-from drivers.wires.camera_connection import Connection, Shot
-from drivers.wires.camera_errors import device_error, lacks_control
-from drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
-from drivers.wires.frame_count import FrameCount
-from foundation.calls import Lane, Result
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError, Unreachable
-from foundation.readings import Frame, Reading, bad_reading
+from thermostand.drivers.framing.aravis_library import AravisError
+from thermostand.drivers.settings import Identity
+from thermostand.drivers.wires.camera_connection import Connection, Shot
+from thermostand.drivers.wires.camera_errors import device_error, lacks_control
+from thermostand.drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
+from thermostand.drivers.wires.frame_count import FrameCount
+from thermostand.foundation.calls import Lane, Result
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError, Unreachable
+from thermostand.foundation.readings import Frame, Reading, bad_reading
 
 Settings = GigeCameraSettings
 ATTEMPTS = 3  # frames in a row that may fail before the camera counts as lost

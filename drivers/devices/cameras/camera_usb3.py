@@ -1,6 +1,6 @@
 """A USB3 Vision camera: the same driver over Aravis' other transport. No unit was seen, and no fake of one exists."""
 
-from drivers.devices.cameras.camera_gige import Camera as Camera
-from drivers.wires.camera_settings import Usb3CameraSettings
+from thermostand.drivers.devices.cameras.camera_gige import Camera as Camera
+from thermostand.drivers.wires.camera_settings import Usb3CameraSettings
 
 Settings = Usb3CameraSettings

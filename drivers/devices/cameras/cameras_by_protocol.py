@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, Union, cast
 
 from pydantic import Discriminator, Tag
 
-import drivers.devices.cameras
-from drivers.devices.protocols import Camera
-from drivers.settings import CameraSettings
-from foundation.clock import Clock
-from foundation.document_faults import TAG
+import thermostand.drivers.devices.cameras
+from thermostand.drivers.devices.protocols import Camera
+from thermostand.drivers.settings import CameraSettings
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.document_faults import TAG
 
 _PREFIX, _USUAL = "camera_", "gige"
 
@@ -28,9 +28,11 @@ class _Driver(Protocol):
 
 
 def _found() -> dict[str, _Driver]:
-    names = sorted(module.name for module in pkgutil.iter_modules(drivers.devices.cameras.__path__))
+    names = sorted(module.name for module in pkgutil.iter_modules(thermostand.drivers.devices.cameras.__path__))
     return {
-        name.removeprefix(_PREFIX): cast("_Driver", importlib.import_module(f"drivers.devices.cameras.{name}"))
+        name.removeprefix(_PREFIX): cast(
+            "_Driver", importlib.import_module(f"thermostand.drivers.devices.cameras.{name}")
+        )
         for name in names
         if name.startswith(_PREFIX)
     }

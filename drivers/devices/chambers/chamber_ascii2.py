@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
-from drivers.devices.chambers.chamber_settings import Ascii2Settings
-from drivers.wires.link import SerialSettings
-from foundation.errors import Unreachable
+from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
+from thermostand.drivers.devices.chambers.chamber_settings import Ascii2Settings
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.errors import Unreachable
 
 _FIELD = re.compile(r"-?\d{3,4}\.\d")
 _DIGITS = re.compile(r"[01]{26}|[01]{32}")

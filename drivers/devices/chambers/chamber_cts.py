@@ -15,10 +15,10 @@ from functools import reduce
 from operator import xor
 from typing import TypeVar
 
-from drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
-from drivers.devices.chambers.chamber_settings import CtsSettings
-from drivers.wires.link import SerialSettings
-from foundation.errors import Refused
+from thermostand.drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
+from thermostand.drivers.devices.chambers.chamber_settings import CtsSettings
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.errors import Refused
 
 Found = TypeVar("Found")
 

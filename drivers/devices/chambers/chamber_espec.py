@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState, whole_line
-from drivers.devices.chambers.chamber_settings import EspecSettings
-from drivers.wires.link import SerialSettings
-from foundation.errors import GarbledReply, Refused
+from thermostand.drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState, whole_line
+from thermostand.drivers.devices.chambers.chamber_settings import EspecSettings
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.errors import GarbledReply, Refused
 
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 _MODES = {"OFF": False, "STANDBY": False, "CONSTANT": True, "RUN": True}

@@ -12,10 +12,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, whole_line
-from drivers.devices.chambers.chamber_settings import JulaboSettings
-from drivers.wires.link import SerialSettings
-from foundation.errors import GarbledReply, Refused, Unreachable
+from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, whole_line
+from thermostand.drivers.devices.chambers.chamber_settings import JulaboSettings
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.errors import GarbledReply, Refused, Unreachable
 
 _NUMBER = re.compile(r"-?\d{1,3}\.\d{1,2}")
 _STATUS = re.compile(r"(-?\d{2}) ([ -~]{1,80})")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from drivers.devices.chambers.chamber_settings import ChamberUnitSettings
-from drivers.wires.line_client import LineClient
-from drivers.wires.link import SerialSettings
+from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings
+from thermostand.drivers.wires.line_client import LineClient
+from thermostand.drivers.wires.link import SerialSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.settings import Line, Polled, Range
-from foundation.addresses import ByteAddress
+from thermostand.drivers.settings import Line, Polled, Range
+from thermostand.foundation.addresses import ByteAddress
 
 
 class ChamberUnitSettings(Polled):

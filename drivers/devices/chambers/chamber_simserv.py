@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import re
 
-from drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
-from drivers.devices.chambers.chamber_settings import SimservSettings
-from drivers.wires.link import SerialSettings
-from foundation.errors import GarbledReply, Refused
+from thermostand.drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
+from thermostand.drivers.devices.chambers.chamber_settings import SimservSettings
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.errors import GarbledReply, Refused
 
 _MARK = "\xb6"  # a byte of Latin-1, not of UTF-8
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")

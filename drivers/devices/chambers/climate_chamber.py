@@ -10,15 +10,15 @@ import importlib
 from collections.abc import Callable
 from typing import Protocol, cast
 
-from drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
-from drivers.devices.chambers.chamber_settings import ChamberUnitSettings
-from drivers.devices.exclusive import Exclusive
-from drivers.devices.in_force import InForce
-from drivers.settings import Identity, same_device
-from foundation.calls import Lane, Result
-from foundation.clock import Clock, call_pause_s, seconds_ns
-from foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
-from foundation.readings import Reading
+from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
+from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings
+from thermostand.drivers.devices.exclusive import Exclusive
+from thermostand.drivers.devices.in_force import InForce
+from thermostand.drivers.settings import Identity, same_device
+from thermostand.foundation.calls import Lane, Result
+from thermostand.foundation.clock import Clock, call_pause_s, seconds_ns
+from thermostand.foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
+from thermostand.foundation.readings import Reading
 
 _LOOKS = 3  # at a state that follows its command a scan of the unit later
 _RENEW_S = 60.0
@@ -46,7 +46,7 @@ class ClimateChamber:
         self._allowed_degC = allowed_degC
         self._clock = clock
         protocol = settings.model_dump()["protocol"]
-        module = cast("_Module", importlib.import_module(f"drivers.devices.chambers.chamber_{protocol}"))
+        module = cast("_Module", importlib.import_module(f"thermostand.drivers.devices.chambers.chamber_{protocol}"))
         gap_s = call_pause_s(clock, settings.gap_s)
         self._language = module.Language(name, settings.model_copy(update={"gap_s": gap_s}))
         self.dead_man = self._language.dead_man

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.devices.imager.radiometry import Air, Planck, Surroundings
-from foundation.image_limit import size_fault
+from thermostand.drivers.devices.imager.radiometry import Air, Planck, Surroundings
+from thermostand.foundation.image_limit import size_fault
 
 _START, _END = b"\xff\xd8", b"\xff\xd9"
 _APP1, _SCAN, _END_OF_IMAGE = 0xE1, 0xDA, 0xD9

@@ -18,16 +18,23 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
-from drivers.devices.imager.radiometry import temperatures_degC
-from drivers.settings import DeviceName, Identity, Polled
-from foundation.calls import Lane
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.documents import Document
-from foundation.errors import Unreachable
-from foundation.events import CLOCK_SET_BACK, NO_PICTURE, PICTURE_LEFT_OUT, PICTURE_TAKEN, PICTURES_BACK, PICTURES_LOST
-from foundation.items import Event, Item, Original
-from foundation.readings import Quality, Reading, bad_reading
+from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
+from thermostand.drivers.devices.imager.radiometry import temperatures_degC
+from thermostand.drivers.settings import DeviceName, Identity, Polled
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import Unreachable
+from thermostand.foundation.events import (
+    CLOCK_SET_BACK,
+    NO_PICTURE,
+    PICTURE_LEFT_OUT,
+    PICTURE_TAKEN,
+    PICTURES_BACK,
+    PICTURES_LOST,
+)
+from thermostand.foundation.items import Event, Item, Original
+from thermostand.foundation.readings import Quality, Reading, bad_reading
 
 _SUFFIXES = (".jpg", ".jpeg")
 _LARGEST_BYTES = 20_000_000

@@ -13,14 +13,14 @@ import usb.core
 import usb.util
 from pydantic import Field, model_validator
 
-from drivers.devices.motion.flap_travel import POLL_S, Travel
-from drivers.devices.motion.motion import Motion, Turn
-from drivers.settings import Identity, Polled, same_device
-from foundation.addresses import TcpAddress
-from foundation.calls import Lane, Result
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Superseded, Unreachable
-from foundation.readings import Quality, Reading, bad_reading
+from thermostand.drivers.devices.motion.flap_travel import POLL_S, Travel
+from thermostand.drivers.devices.motion.motion import Motion, Turn
+from thermostand.drivers.settings import Identity, Polled, same_device
+from thermostand.foundation.addresses import TcpAddress
+from thermostand.foundation.calls import Lane, Result
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Superseded, Unreachable
+from thermostand.foundation.readings import Quality, Reading, bad_reading
 
 _VENDOR_POLOLU = 0x1FFB
 _PRODUCTS_JRK_G2 = {0x00B7: "18v27", 0x00B9: "24v21", 0x00BF: "18v19", 0x00C1: "24v13", 0x00C5: "21v3"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from foundation.clock import seconds_ns
+from thermostand.foundation.clock import seconds_ns
 
 POLL_S = 0.05
 CONFIRMATIONS = 3

@@ -7,7 +7,7 @@ lane, is never sent: a stop goes through the same lane, comes after all that was
 
 from __future__ import annotations
 
-from foundation.errors import Superseded
+from thermostand.foundation.errors import Superseded
 
 
 class Turn:

@@ -14,17 +14,17 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.devices.motion.motion import Motion, Turn
-from drivers.devices.motion.stage_identity import changed_settings, identity_of, power_off_s, speed_steps_s
-from drivers.devices.motion.stage_profiles import PROFILES, ProfileName, StageProfile
-from drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
-from drivers.wires.link import SerialSettings, open_link
-from drivers.wires.ximc_client import XimcClient
-from foundation.addresses import ByteAddress
-from foundation.calls import Lane, Result
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceAlarm, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
-from foundation.readings import Quality, Reading
+from thermostand.drivers.devices.motion.motion import Motion, Turn
+from thermostand.drivers.devices.motion.stage_identity import changed_settings, identity_of, power_off_s, speed_steps_s
+from thermostand.drivers.devices.motion.stage_profiles import PROFILES, ProfileName, StageProfile
+from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
+from thermostand.drivers.wires.link import SerialSettings, open_link
+from thermostand.drivers.wires.ximc_client import XimcClient
+from thermostand.foundation.addresses import ByteAddress
+from thermostand.foundation.calls import Lane, Result
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceAlarm, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
+from thermostand.foundation.readings import Quality, Reading
 
 _LINE = SerialSettings(baud=115200, stopbits=2)
 _MICROSTEPS = 256

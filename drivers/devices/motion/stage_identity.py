@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import struct
 
-from drivers.devices.motion.stage_profiles import StageProfile
-from drivers.settings import Identity
-from drivers.wires.ximc_client import XimcClient
-from foundation.errors import Refused
+from thermostand.drivers.devices.motion.stage_profiles import StageProfile
+from thermostand.drivers.settings import Identity
+from thermostand.drivers.wires.ximc_client import XimcClient
+from thermostand.foundation.errors import Refused
 
 _FIRMWARE = struct.Struct("<BBH")  # GFWV: major, minor, release
 _MADE = struct.Struct("<4s2s8sBBH12x")  # GETI: manufacturer, its id, product, version of the hardware

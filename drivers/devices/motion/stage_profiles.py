@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from drivers.settings import Line
-from foundation.documents import Document
+from thermostand.drivers.settings import Line
+from thermostand.foundation.documents import Document
 
 
 class StageProfile(Document):

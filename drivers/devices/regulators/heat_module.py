@@ -12,13 +12,13 @@ from typing import NoReturn, Self
 
 from pydantic import Field, model_validator
 
-from drivers.devices.exclusive import Exclusive
-from drivers.devices.relays import COIL_OFF, COIL_ON
-from drivers.settings import Identity, OnBus
-from drivers.wires.modbus_unit import ModbusUnit
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
-from foundation.readings import Quality, Reading
+from thermostand.drivers.devices.exclusive import Exclusive
+from thermostand.drivers.devices.relays import COIL_OFF, COIL_ON
+from thermostand.drivers.settings import Identity, OnBus
+from thermostand.drivers.wires.modbus_unit import ModbusUnit
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
+from thermostand.foundation.readings import Quality, Reading
 
 _TOLERANCE_mA = 0.1  # of what reads back: the modules are good to 0.02 mA
 _TOLERANCE_s = 0.05  # of its watchdog's time, which it keeps in tenths

@@ -10,11 +10,11 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.devices.protocols import Switches
-from drivers.devices.relays import HEAT
-from foundation.clock import NS_PER_S, Now, seconds_ns
-from foundation.documents import Document
-from foundation.errors import DeviceFault, Refused
+from thermostand.drivers.devices.protocols import Switches
+from thermostand.drivers.devices.relays import HEAT
+from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import DeviceFault, Refused
 
 _OVERLAP_S = 2.0  # that a full output is held beyond its cycle: the next pulse may come late
 _TOLERANCE_S = 1.0  # of the board's timer against our clock, and of a reply that was late

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import Field
 
-from foundation.documents import Document
+from thermostand.foundation.documents import Document
 
 
 class Law(Document):

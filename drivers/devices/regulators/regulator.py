@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from drivers.devices.exclusive import Exclusive
-from drivers.devices.in_force import InForce
-from drivers.settings import Identity
-from drivers.wires.bus import Bus
-from drivers.wires.modbus_unit import CONFIRM_LOOKS, ModbusUnit, Sample, Snapshot, is_confirmed, objection
-from drivers.wires.registers import RegisterMap
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import ConfigError, DeviceFault, Occupied, Refused
-from foundation.readings import Reading, bad_reading
+from thermostand.drivers.devices.exclusive import Exclusive
+from thermostand.drivers.devices.in_force import InForce
+from thermostand.drivers.settings import Identity
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.modbus_unit import CONFIRM_LOOKS, ModbusUnit, Sample, Snapshot, is_confirmed, objection
+from thermostand.drivers.wires.registers import RegisterMap
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import ConfigError, DeviceFault, Occupied, Refused
+from thermostand.foundation.readings import Reading, bad_reading
 
 PROBE_PERIOD_S = 30.0
 AUTOTUNE = "autotune"

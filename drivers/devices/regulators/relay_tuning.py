@@ -28,9 +28,9 @@ from dataclasses import dataclass, replace
 
 from pydantic import Field
 
-from drivers.devices.regulators.pid import Law
-from foundation.clock import NS_PER_S
-from foundation.documents import Document
+from thermostand.drivers.devices.regulators.pid import Law
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.documents import Document
 
 _PERIODS = 4  # that have to agree
 _AGREE = 0.2  # each with their mean: amplitude and period; and the shares with one half

@@ -15,19 +15,19 @@ from typing import Literal
 
 from pydantic import Field
 
-from drivers.devices.in_force import InForce
-from drivers.devices.protocols import HeatOutput
-from drivers.devices.regulators import pid, relay_tuning
-from drivers.devices.regulators.heat_pulses import PulsesSettings
-from drivers.devices.regulators.pid import Law
-from drivers.devices.regulators.relay_tuning import Found, Tuning, TuningSettings
-from drivers.settings import DeviceName, Identity, Polled
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.errors import DeviceError, DeviceFault, Occupied, Refused
-from foundation.events import AUTOTUNED
-from foundation.items import Item
-from foundation.readings import Quality, Reading, bad_reading
-from foundation.tasks import cancelled, failure_text
+from thermostand.drivers.devices.in_force import InForce
+from thermostand.drivers.devices.protocols import HeatOutput
+from thermostand.drivers.devices.regulators import pid, relay_tuning
+from thermostand.drivers.devices.regulators.heat_pulses import PulsesSettings
+from thermostand.drivers.devices.regulators.pid import Law
+from thermostand.drivers.devices.regulators.relay_tuning import Found, Tuning, TuningSettings
+from thermostand.drivers.settings import DeviceName, Identity, Polled
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError, DeviceFault, Occupied, Refused
+from thermostand.foundation.events import AUTOTUNED
+from thermostand.foundation.items import Item
+from thermostand.foundation.readings import Quality, Reading, bad_reading
+from thermostand.foundation.tasks import cancelled, failure_text
 
 _REST_K, _REST_S = 0.5, 600.0  # how near, and for how long, the set-point is held before it is tuned about
 

@@ -15,17 +15,17 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.gige import gvcp, gvsp
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.camera_schedule import Schedule, Shot
-from drivers.sim.gige.dressed_registers import DressedRegisters
-from drivers.sim.gige.genicam import TICKS_PER_S, features
-from drivers.sim.gige.genicam_file import GenicamFile
-from drivers.sim.gige.gvcp import Nack, Resend, Status
-from drivers.sim.gige.gvcp_device import ControlChannel, Peer
-from drivers.sim.gige.gvsp_pixels import binned, encoded
-from drivers.sim.gige.gvsp_sender import CameraFaults, StreamCounts, StreamSender
-from foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
+from thermostand.drivers.sim.gige import gvcp, gvsp
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.camera_schedule import Schedule, Shot
+from thermostand.drivers.sim.gige.dressed_registers import DressedRegisters
+from thermostand.drivers.sim.gige.genicam import TICKS_PER_S, features
+from thermostand.drivers.sim.gige.genicam_file import GenicamFile
+from thermostand.drivers.sim.gige.gvcp import Nack, Resend, Status
+from thermostand.drivers.sim.gige.gvcp_device import ControlChannel, Peer
+from thermostand.drivers.sim.gige.gvsp_pixels import binned, encoded
+from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamCounts, StreamSender
+from thermostand.foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
 
 Render = Callable[[int, float, float, int], NDArray[np.uint8]]
 

@@ -6,8 +6,8 @@ import ipaddress
 import struct
 import zlib
 
-from drivers.sim.gige.genicam import XML_ADDRESS, XML_NAME, Feature, to_xml
-from drivers.sim.gige.gvcp import Nack, Status
+from thermostand.drivers.sim.gige.genicam import XML_ADDRESS, XML_NAME, Feature, to_xml
+from thermostand.drivers.sim.gige.gvcp import Nack, Status
 
 CAN_CONCATENATE, CAN_WRITE_MEMORY, CAN_RESEND, CAN_PEND = 1 << 0, 1 << 1, 1 << 2, 1 << 5
 HAS_USER_NAME, HAS_SERIAL = 1 << 31, 1 << 30

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.sim.gige.camera_registers import Registers
-from drivers.sim.gige.genicam import MAX_RATE_Hz
-from foundation.clock import NS_PER_S
+from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.genicam import MAX_RATE_Hz
+from thermostand.foundation.clock import NS_PER_S
 
 _IDLE_ns = NS_PER_S
 _SINGLE_FRAME = 1

@@ -10,15 +10,15 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 
-from drivers.framing.aravis_library import AravisError
-from drivers.sim.gige import gvcp
-from drivers.sim.gige.camera_registers import BOOTSTRAP_bytes, Registers, largest
-from drivers.sim.gige.genicam import Feature
-from drivers.sim.gige.genicam_file import GenicamFile
-from drivers.sim.gige.genicam_memory import Evaluated
-from drivers.sim.gige.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
-from drivers.sim.gige.gvsp import PixelFormat
-from foundation.errors import ConfigError
+from thermostand.drivers.framing.aravis_library import AravisError
+from thermostand.drivers.sim.gige import gvcp
+from thermostand.drivers.sim.gige.camera_registers import BOOTSTRAP_bytes, Registers, largest
+from thermostand.drivers.sim.gige.genicam import Feature
+from thermostand.drivers.sim.gige.genicam_file import GenicamFile
+from thermostand.drivers.sim.gige.genicam_memory import Evaluated
+from thermostand.drivers.sim.gige.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
+from thermostand.drivers.sim.gige.gvsp import PixelFormat
+from thermostand.foundation.errors import ConfigError
 
 XML_ADDRESS = 0x7E000000  # no register of the makes known lies there
 

@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.sim.gige.gvsp import PixelFormat
+from thermostand.drivers.sim.gige.gvsp import PixelFormat
 
 XML_ADDRESS = 0x40000
 XML_NAME = "thermostand_camera.xml"

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from foundation.errors import ConfigError
+from thermostand.foundation.errors import ConfigError
 
 LARGEST_bytes = 16 << 20  # ten times the largest of 27 makes and models
 _ZIP = b"PK\x03\x04"

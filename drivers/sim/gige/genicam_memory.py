@@ -11,9 +11,9 @@ import functools
 from contextlib import suppress
 from typing import Any
 
-from drivers.framing.aravis_library import AravisError, library
-from drivers.sim.gige.genicam_file import GenicamFile
-from foundation.errors import ConfigError
+from thermostand.drivers.framing.aravis_library import AravisError, library
+from thermostand.drivers.sim.gige.genicam_file import GenicamFile
+from thermostand.foundation.errors import ConfigError
 
 _PAGE_bytes = 4096
 _ADDRESS_MASK = 0xFFFFFFFF  # GVCP carries 32 bits of an address, also of a file for USB3 Vision

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator
 
-from drivers.framing.aravis_library import AravisError
-from drivers.sim.gige.genicam_memory import Evaluated
+from thermostand.drivers.framing.aravis_library import AravisError
+from thermostand.drivers.sim.gige.genicam_memory import Evaluated
 
 # What a camera of these wants is there: enumerations with the entries that matter, from the GenICam files of 12 makes.
 ENTRIES = {

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from drivers.sim.gige import gvcp
-from drivers.sim.gige.camera_registers import DISCOVERY_bytes, Registers
-from drivers.sim.gige.gvcp import Ack, Command, Nack, Request, Resend, Status
+from thermostand.drivers.sim.gige import gvcp
+from thermostand.drivers.sim.gige.camera_registers import DISCOVERY_bytes, Registers
+from thermostand.drivers.sim.gige.gvcp import Ack, Command, Nack, Request, Resend, Status
 
 Peer = tuple[str, int]
 

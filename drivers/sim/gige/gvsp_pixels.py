@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.gige.gvsp import PixelFormat
+from thermostand.drivers.sim.gige.gvsp import PixelFormat
 
 _BITS = {PixelFormat.MONO10: 10, PixelFormat.MONO12: 12, PixelFormat.MONO16: 16}
 _IN_THREE_BYTES = {PixelFormat.MONO10PACKED: 10, PixelFormat.MONO12PACKED: 12}

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
-from drivers.sim.gige import gvsp
-from drivers.sim.gige.gvcp import Resend
-from drivers.sim.gige.gvsp import Block
-from drivers.sim.gige.switch import Switch
+from thermostand.drivers.sim.gige import gvsp
+from thermostand.drivers.sim.gige.gvcp import Resend
+from thermostand.drivers.sim.gige.gvsp import Block
+from thermostand.drivers.sim.gige.switch import Switch
 
 Destination = tuple[str, int]
 

@@ -10,11 +10,11 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from drivers.sim.usb import Stall, TimedOut
-from foundation.clock import NS_PER_S, Now
+from thermostand.drivers.sim.usb import Stall, TimedOut
+from thermostand.foundation.clock import NS_PER_S, Now
 
 if TYPE_CHECKING:
-    from drivers.sim.physics.plant import Plant
+    from thermostand.drivers.sim.physics.plant import Plant
 
 VENDOR_ID, PRODUCT_ID_21V3 = 0x1FFB, 0x00C5
 FULL_SCALE = 4095

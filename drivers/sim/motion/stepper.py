@@ -11,8 +11,8 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
-from drivers.sim.motion.kinematics import Pace, Path, path_onward, path_to, path_to_halt, rest
-from foundation.clock import NS_PER_S, seconds_ns
+from thermostand.drivers.sim.motion.kinematics import Pace, Path, path_onward, path_to, path_to_halt, rest
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
 
 LEFT, RIGHT = -1, 1
 SWITCH_PLAY = 1 / 256  # steps; a stage stopped by a switch keeps it closed in spite of rounding

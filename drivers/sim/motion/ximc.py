@@ -12,14 +12,14 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
-from drivers.framing.ximc import Damage, Frame, decode, encode
-from drivers.sim.motion import ximc_table as table
-from drivers.sim.motion.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Run, Shift, Stepper
-from drivers.sim.motion.ximc_settings import Settings
-from foundation.clock import Now
+from thermostand.drivers.framing.ximc import Damage, Frame, decode, encode
+from thermostand.drivers.sim.motion import ximc_table as table
+from thermostand.drivers.sim.motion.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Run, Shift, Stepper
+from thermostand.drivers.sim.motion.ximc_settings import Settings
+from thermostand.foundation.clock import Now
 
 if TYPE_CHECKING:
-    from drivers.sim.physics.plant import Plant
+    from thermostand.drivers.sim.physics.plant import Plant
 
 PARTIAL_FRAME_S = 0.4  # real seconds of silence inside a frame after which the controller forgets it
 MOTION = frozenset({"move", "movr", "left", "rigt", "home", "loft", "sstp"})

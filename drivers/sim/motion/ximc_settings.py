@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import struct
 
-from drivers.sim.motion import ximc_table as table
-from drivers.sim.motion.kinematics import Pace
-from drivers.sim.motion.stepper import LEFT, RIGHT, Leg, Run, Shift, Stops
-from foundation.clock import seconds_ns
+from thermostand.drivers.sim.motion import ximc_table as table
+from thermostand.drivers.sim.motion.kinematics import Pace
+from thermostand.drivers.sim.motion.stepper import LEFT, RIGHT, Leg, Run, Shift, Stops
+from thermostand.foundation.clock import seconds_ns
 
 
 class Settings:

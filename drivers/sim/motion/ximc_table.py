@@ -10,7 +10,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.sim.motion.stepper import Switches
+from thermostand.drivers.sim.motion.stepper import Switches
 
 # Commands that only act; the request carries this payload and the reply is the bare letters.
 ACTIONS: Mapping[str, str] = dict.fromkeys(

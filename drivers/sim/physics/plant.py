@@ -18,9 +18,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.sim.physics.bouc_wen import BoucWen
-from drivers.sim.physics.chamber_spec import ChamberSpec, drawn
-from drivers.sim.physics.optics import Camera, CameraKind, Nodes, Optics, Placement, optics_at, optics_of
+from thermostand.drivers.sim.physics.bouc_wen import BoucWen
+from thermostand.drivers.sim.physics.chamber_spec import ChamberSpec, drawn
+from thermostand.drivers.sim.physics.optics import Camera, CameraKind, Nodes, Optics, Placement, optics_at, optics_of
 
 NS_PER_S = 1_000_000_000
 STEP_s = 0.5

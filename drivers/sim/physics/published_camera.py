@@ -16,9 +16,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera_preset import Bounds, CameraPreset, Effect
-from drivers.sim.physics.optics import Camera, PITCH_mm, REFERENCE_degC
-from drivers.sim.physics.wear import Fixings, Lag, Play, StickSlip
+from thermostand.drivers.camera_preset import Bounds, CameraPreset, Effect
+from thermostand.drivers.sim.physics.optics import Camera, PITCH_mm, REFERENCE_degC
+from thermostand.drivers.sim.physics.wear import Fixings, Lag, Play, StickSlip
 
 CHIP, BODY, CELL, GLASS, MOUNT = range(5)
 _CAPACITY_J_K = (25.0, 260.0, 180.0, 90.0, 900.0)

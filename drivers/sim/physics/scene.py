@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.physics.optics import HEIGHT_px, Optics, WIDTH_px, outlines_px, true_centres_px
+from thermostand.drivers.sim.physics.optics import HEIGHT_px, Optics, WIDTH_px, outlines_px, true_centres_px
 
 __all__ = ["Scene", "SceneSpec", "true_centres_px"]
 

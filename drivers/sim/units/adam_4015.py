@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.sim.units.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, Refusal, reads_words, writes_one
-from drivers.sim.units.rtd_sensors import CHANNELS, Places, RtdModule, check_span
-from foundation.clock import Now
+from thermostand.drivers.sim.units.modbus import ILLEGAL_ADDRESS, ILLEGAL_VALUE, Refusal, reads_words, writes_one
+from thermostand.drivers.sim.units.rtd_sensors import CHANNELS, Places, RtdModule, check_span
+from thermostand.foundation.clock import Now
 
 VALUES, TYPE_CODES, NAME = 0, 200, 210  # 40001, 40201, 40211
 ADAM_4015 = (0x40, 0x15)

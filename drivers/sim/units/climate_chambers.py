@@ -11,8 +11,8 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.sim.units.modbus import Timeline
-from foundation.clock import NS_PER_S, Now
+from thermostand.drivers.sim.units.modbus import Timeline
+from thermostand.foundation.clock import NS_PER_S, Now
 
 PROPORTIONAL_BAND_K = 3.0
 

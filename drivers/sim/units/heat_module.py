@@ -12,7 +12,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol
 
-from drivers.sim.units.modbus import (
+from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
     OPERATION_ERROR,
@@ -24,7 +24,7 @@ from drivers.sim.units.modbus import (
     writes_one,
     writes_words,
 )
-from foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
 
 OUTPUTS = 4
 COIL_ON, COIL_OFF = 0xFF00, 0x0000

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber
-from foundation.clock import Now
+from thermostand.drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber
+from thermostand.foundation.clock import Now
 
 _VERSION = "JULABO TEST 1.0 V 1.20"
 _INVALID = "-08 INVALID COMMAND"

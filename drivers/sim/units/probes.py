@@ -9,8 +9,8 @@ from __future__ import annotations
 import random
 from typing import Literal
 
-from drivers.sim.physics.plant import Plant
-from foundation.clock import Now
+from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.foundation.clock import Now
 
 ProbeKind = Literal["hart", "vaisala"]
 _NOISE_K, _NOISE_PERCENT = 0.002, 0.05

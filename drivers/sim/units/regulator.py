@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from enum import IntEnum
 from typing import Protocol
 
-from drivers.sim.units import self_tuning
-from drivers.sim.units.modbus import (
+from thermostand.drivers.sim.units import self_tuning
+from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
     OPERATION_ERROR,
@@ -24,8 +24,8 @@ from drivers.sim.units.modbus import (
     writes_one,
     writes_words,
 )
-from drivers.sim.units.pid import OFF, Outputs, PidState, on_time_ns, resume, start, step
-from drivers.sim.units.regulator_table import (
+from thermostand.drivers.sim.units.pid import OFF, Outputs, PidState, on_time_ns, resume, start, step
+from thermostand.drivers.sim.units.regulator_table import (
     COOL_PERIOD,
     HEAT_PERIOD,
     INPUT_SHIFT,
@@ -43,7 +43,7 @@ from drivers.sim.units.regulator_table import (
     to_value,
     to_word,
 )
-from foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
 
 MOST_WORDS = 104
 STILL_AIR_LAG_S = 30.0  # of a probe that hangs in the laboratory

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from drivers.sim.units.pid import Gains, Side
+from thermostand.drivers.sim.units.pid import Gains, Side
 
 PT100_RANGE_DEGC = (-199.9, 500.0)  # input type 1
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.sim.units.modbus import (
+from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
@@ -23,7 +23,7 @@ from drivers.sim.units.modbus import (
     writes_bits,
     writes_one,
 )
-from foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
 
 RELAYS = 8
 ALL_RELAYS = 0x00FF

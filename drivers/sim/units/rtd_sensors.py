@@ -6,8 +6,8 @@ import random
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from drivers.sim.units.modbus import ILLEGAL_ADDRESS, Handler, Refusal, Timeline, answer
-from foundation.clock import Now
+from thermostand.drivers.sim.units.modbus import ILLEGAL_ADDRESS, Handler, Refusal, Timeline, answer
+from thermostand.foundation.clock import Now
 
 CHANNELS = 6
 

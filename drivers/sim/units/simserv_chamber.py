@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber
-from foundation.clock import Now
+from thermostand.drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber
+from thermostand.foundation.clock import Now
 
 _ACCEPTED, _NO_COMMAND, _BAD_PARAMETER, _NO_CHANNEL = "1", "-5", "-6", "-8"
 

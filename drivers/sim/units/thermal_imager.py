@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.units.modbus import Timeline
-from drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
-from foundation.clock import NS_PER_S, seconds_ns
+from thermostand.drivers.sim.units.modbus import Timeline
+from thermostand.drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
 
 SERIAL_NUMBER = "49001234"
 SPOT_RADIUS_px = 8

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.sim.units.modbus import (
+from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
@@ -17,8 +17,8 @@ from drivers.sim.units.modbus import (
     reads_words,
     writes_one,
 )
-from drivers.sim.units.rtd_sensors import CHANNELS, Places, RtdModule, check_span
-from foundation.clock import Now
+from thermostand.drivers.sim.units.rtd_sensors import CHANNELS, Places, RtdModule, check_span
+from thermostand.foundation.clock import Now
 
 FAULT_BITS = 0x80
 FORMAT_COIL = 0x10C

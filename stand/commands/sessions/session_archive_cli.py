@@ -11,20 +11,20 @@ from typing import Annotated
 
 import typer
 
-from foundation.clock import WallClock
-from foundation.command_app import App
-from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import FAILED
-from foundation.output import output, say, show
-from foundation.progress import late_progress
-from foundation.usage import one_line, tell
-from recording.exporting.archive import Rule, archive, delete, unfit
-from recording.reading.catalogue import Entry
-from stand.commands.reached import ConfigOption
-from stand.commands.sessions.session_args import check_folder
-from stand.commands.sessions.session_list_cli import sessions_at, user_name
-from stand.commands.sessions.session_table import size
-from stand.config.stand_config import load_config, packaged
+from thermostand.foundation.clock import WallClock
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.exit_codes import FAILED
+from thermostand.foundation.output import output, say, show
+from thermostand.foundation.progress import late_progress
+from thermostand.foundation.usage import one_line, tell
+from thermostand.recording.exporting.archive import Rule, archive, delete, unfit
+from thermostand.recording.reading.catalogue import Entry
+from thermostand.stand.commands.reached import ConfigOption
+from thermostand.stand.commands.sessions.session_args import check_folder
+from thermostand.stand.commands.sessions.session_list_cli import sessions_at, user_name
+from thermostand.stand.commands.sessions.session_table import size
+from thermostand.stand.config.stand_config import load_config, packaged
 
 app = App(no_args_is_help=True)
 _NICENESS = 15  # whatever a stand does on this computer goes first

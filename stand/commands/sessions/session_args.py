@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from foundation.errors import ConfigError
-from recording.format.inventory import inventory
+from thermostand.foundation.errors import ConfigError
+from thermostand.recording.format.inventory import inventory
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a recorded session.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="The folder to make; it must not exist.")]

@@ -12,36 +12,36 @@ from typing import Annotated, Literal
 
 import typer
 
-from foundation.clock import NS_PER_S, VirtualClock
-from foundation.command_app import App
-from foundation.errors import ConfigError, SessionError
-from foundation.exit_codes import FAILED
-from foundation.hub import Hub
-from foundation.instants import parse_instant
-from foundation.items import Event, Item, StepMark
-from foundation.output import json_line, output, say, show
-from foundation.progress import Report, late_progress, progress
-from foundation.usage import one_line
-from recording.exporting.export import export
-from recording.exporting.one_file import export_mcap
-from recording.exporting.replay import ReplayClock, replay, replay_and_record
-from recording.exporting.trim import trim
-from recording.format.damage import FileDamaged
-from recording.format.inventory import State, inventory
-from recording.reading.glance import Glance, glance
-from recording.reading.overview import overview
-from recording.reading.session import Session
-from recording.reading.using import check_whole
-from recording.repair.salvage import Salvaged, salvage_line, salvage_session
-from recording.repair.verify import verify
-from stand.commands.sessions.session_args import (
+from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.command_app import App
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.exit_codes import FAILED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.instants import parse_instant
+from thermostand.foundation.items import Event, Item, StepMark
+from thermostand.foundation.output import json_line, output, say, show
+from thermostand.foundation.progress import Report, late_progress, progress
+from thermostand.foundation.usage import one_line
+from thermostand.recording.exporting.export import export
+from thermostand.recording.exporting.one_file import export_mcap
+from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
+from thermostand.recording.exporting.trim import trim
+from thermostand.recording.format.damage import FileDamaged
+from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.reading.glance import Glance, glance
+from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.session import Session
+from thermostand.recording.reading.using import check_whole
+from thermostand.recording.repair.salvage import Salvaged, salvage_line, salvage_session
+from thermostand.recording.repair.verify import verify
+from thermostand.stand.commands.sessions.session_args import (
     IncompleteOption,
     OutOption,
     SessionArgument,
     check_folder,
     check_session,
 )
-from stand.commands.sessions.session_text import info_json, info_lines, verify_json, verify_lines
+from thermostand.stand.commands.sessions.session_text import info_json, info_lines, verify_json, verify_lines
 
 app = App(
     no_args_is_help=True,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from foundation.usage import Lazy, lazy_app
+from thermostand.foundation.usage import Lazy, lazy_app
 
-_LIST, _WORK = "stand.commands.sessions.session_list_cli", "stand.commands.sessions.session_cli"
+_LIST, _WORK = "thermostand.stand.commands.sessions.session_list_cli", "thermostand.stand.commands.sessions.session_cli"
 
 app = lazy_app(
     "Recorded sessions: list, look at, verify, salvage, replay, export, trim.\n\n"
@@ -14,7 +14,8 @@ app = lazy_app(
         "note": Lazy(_LIST, "Add a note to a session, also while it runs."),
         "tag": Lazy(_LIST, "Give a session tags, or take them away."),
         "archive": Lazy(
-            "stand.commands.sessions.session_archive_cli", "Copy finished sessions to another disk, read back."
+            "thermostand.stand.commands.sessions.session_archive_cli",
+            "Copy finished sessions to another disk, read back.",
         ),
         "info": Lazy(_WORK, "What a session holds: when, steps, frames, gaps, temperatures, events, versions."),
         "verify": Lazy(_WORK, "Read every byte of a session and say what is damaged or missing."),

@@ -14,14 +14,14 @@ from typing import Annotated
 
 import typer
 
-from foundation.command_app import App
-from foundation.output import output, say, show
-from foundation.usage import one_line
-from recording.format.inventory import inventory
-from recording.reading.catalogue import Entry, Report, catalogue, look_at
-from recording.reading.notes import add_note, add_tags, check_tag, read_notes
-from stand.commands.sessions.session_args import SessionArgument, check_folder, check_session
-from stand.commands.sessions.session_table import ON_THE_RIGHT, entry_json, fitting, lines, rows
+from thermostand.foundation.command_app import App
+from thermostand.foundation.output import output, say, show
+from thermostand.foundation.usage import one_line
+from thermostand.recording.format.inventory import inventory
+from thermostand.recording.reading.catalogue import Entry, Report, catalogue, look_at
+from thermostand.recording.reading.notes import add_note, add_tags, check_tag, read_notes
+from thermostand.stand.commands.sessions.session_args import SessionArgument, check_folder, check_session
+from thermostand.stand.commands.sessions.session_table import ON_THE_RIGHT, entry_json, fitting, lines, rows
 
 app = App(no_args_is_help=True)
 _USUAL = {"run": ("complete", "running"), "files": ("sound",)}  # anything else is shown in another colour
@@ -61,7 +61,7 @@ def sessions_at(directory: Path) -> list[Entry]:
     with ExitStack() as stack:
 
         def progress(count: int) -> Report:
-            from foundation.progress import late_progress
+            from thermostand.foundation.progress import late_progress
 
             report = stack.enter_context(late_progress("look at sessions", count))
             return lambda done, text: report(done, one_line(text))
@@ -118,7 +118,7 @@ def tag(
 
 
 def _keep(directory: Path, add: Callable[..., None]) -> None:
-    from foundation.clock import WallClock
+    from thermostand.foundation.clock import WallClock
 
     add(check_session(directory), by=user_name(), time_ns=WallClock().now_ns())
     said = read_notes(directory)

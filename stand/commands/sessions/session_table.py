@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 
-from foundation.instants import date_time, duration, utc_text
-from foundation.usage import one_line
-from recording.reading.catalogue import Entry
+from thermostand.foundation.instants import date_time, duration, utc_text
+from thermostand.foundation.usage import one_line
+from thermostand.recording.reading.catalogue import Entry
 
 COLUMNS = ("session", "recipe", "start (local)", "duration", "frames", "size", "devices", "run", "files")
 ON_THE_RIGHT = frozenset({"duration", "frames", "size"})

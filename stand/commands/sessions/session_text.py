@@ -11,16 +11,16 @@ from dataclasses import asdict, replace
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from foundation.instants import duration, local_text
-from foundation.items import Event, StepState
-from foundation.usage import one_line
-from recording.format.inventory import State
-from recording.format.utc_offsets import UtcOffsets
-from recording.reading.catalogue import Entry, entry_of
-from recording.reading.glance import Glance
-from recording.reading.overview import Frames, Overview, Step, Temperature
-from recording.repair.verify import Verification
-from stand.commands.sessions.session_table import entry_json, size
+from thermostand.foundation.instants import duration, local_text
+from thermostand.foundation.items import Event, StepState
+from thermostand.foundation.usage import one_line
+from thermostand.recording.format.inventory import State
+from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.catalogue import Entry, entry_of
+from thermostand.recording.reading.glance import Glance
+from thermostand.recording.reading.overview import Frames, Overview, Step, Temperature
+from thermostand.recording.repair.verify import Verification
+from thermostand.stand.commands.sessions.session_table import entry_json, size
 
 WIDTH = 100
 _LABEL = 14

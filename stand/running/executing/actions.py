@@ -27,9 +27,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from experiments.steps import AnySoak, Capture, CloseFlap, OpenFlap, PlannedStep, PowerCamera, Prompt, Role
-from foundation.clock import NS_PER_S, seconds_ns
-from stand.running.memory.state import Plan, RunState, SetUp
+from thermostand.experiments.steps import AnySoak, Capture, CloseFlap, OpenFlap, PlannedStep, PowerCamera, Prompt, Role
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.stand.running.memory.state import Plan, RunState, SetUp
 
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
 # chamber left alone for a minute has gone further. The camera, which is slower than the air, has then hardly moved.

@@ -16,20 +16,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.events import (
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.events import (
     CAMERA_EQUILIBRIUM,
     CAMERA_EQUILIBRIUM_LOST,
     CAMERA_OFFSET_CHANGED,
     CAMERA_OFFSET_SAME,
     RUN_BEGINS,
 )
-from foundation.hub import Hub
-from foundation.items import Batch, Event, Item, StepState
-from foundation.readings import Quality, Reading
-from recording.reading.session import Session
-from stand.imaging.camera_cooling import CameraTemperature
-from stand.imaging.equilibrium import CAMERA
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event, Item, StepState
+from thermostand.foundation.readings import Quality, Reading
+from thermostand.recording.reading.session import Session
+from thermostand.stand.imaging.camera_cooling import CameraTemperature
+from thermostand.stand.imaging.equilibrium import CAMERA
 
 AIR = "thermometers.air"
 LIMIT_K = 1.0

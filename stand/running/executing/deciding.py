@@ -15,14 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.known import Answer, Enough, Undecided, Visit, after_decision, fixed_visits
-from experiments.steps import Decide, PlannedStep
-from foundation.calls import Lane
-from foundation.clock import Clock
-from foundation.errors import StandError
-from foundation.helper import Helper
-from stand.running.memory.entries import Edited, edited
-from stand.running.memory.state import RunState
+from thermostand.experiments.known import Answer, Enough, Undecided, Visit, after_decision, fixed_visits
+from thermostand.experiments.steps import Decide, PlannedStep
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.helper import Helper
+from thermostand.stand.running.memory.entries import Edited, edited
+from thermostand.stand.running.memory.state import RunState
 
 _LINE, _KEPT = "design", "design"
 

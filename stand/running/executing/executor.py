@@ -12,24 +12,24 @@ import math
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
 from contextlib import contextmanager
 
-from experiments.known import Undecided
-from experiments.steps import (
+from thermostand.experiments.known import Undecided
+from thermostand.experiments.steps import (
     Capture,
     Decide,
     PlannedStep,
     Role,
 )
-from experiments.steps import Step as PlanStep
-from foundation.clock import NS_PER_S, Clock
-from foundation.errors import ConfigError, DeviceError, Superseded
-from foundation.events import PLAN_CHANGED, STEP_BROKEN_OFF, UNDECIDED, WARM_UP_GAP
-from foundation.hub import Hub
-from foundation.items import StepMark, StepState
-from foundation.readings import UNSETTLED
-from foundation.tasks import cancelled, first_of
-from recording.format.restarts import restarted
-from stand.interlock import Interlocked
-from stand.running.executing.actions import (
+from thermostand.experiments.steps import Step as PlanStep
+from thermostand.foundation.clock import NS_PER_S, Clock
+from thermostand.foundation.errors import ConfigError, DeviceError, Superseded
+from thermostand.foundation.events import PLAN_CHANGED, STEP_BROKEN_OFF, UNDECIDED, WARM_UP_GAP
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import StepMark, StepState
+from thermostand.foundation.readings import UNSETTLED
+from thermostand.foundation.tasks import cancelled, first_of
+from thermostand.recording.format.restarts import restarted
+from thermostand.stand.interlock import Interlocked
+from thermostand.stand.running.executing.actions import (
     Action,
     Aim,
     Begin,
@@ -51,12 +51,12 @@ from stand.running.executing.actions import (
     next_action,
     next_due_ns,
 )
-from stand.running.executing.camera_gap import OffsetWatch
-from stand.running.executing.deciding import Decided, change_of_plan, fixed_plan
-from stand.running.executing.restoring import restore
-from stand.running.executing.settling_watch import SettlingWatch
-from stand.running.executing.soaking import Soaking
-from stand.running.memory.entries import (
+from thermostand.stand.running.executing.camera_gap import OffsetWatch
+from thermostand.stand.running.executing.deciding import Decided, change_of_plan, fixed_plan
+from thermostand.stand.running.executing.restoring import restore
+from thermostand.stand.running.executing.settling_watch import SettlingWatch
+from thermostand.stand.running.executing.soaking import Soaking
+from thermostand.stand.running.memory.entries import (
     Again,
     Change,
     Cooled,
@@ -69,10 +69,10 @@ from stand.running.memory.entries import (
     data_of,
     edited,
 )
-from stand.running.memory.fold import after, change_text, refusal
-from stand.running.memory.journal import Logbook
-from stand.running.memory.state import Plan, RunState
-from stand.stand import Stand
+from thermostand.stand.running.memory.fold import after, change_text, refusal
+from thermostand.stand.running.memory.journal import Logbook
+from thermostand.stand.running.memory.state import Plan, RunState
+from thermostand.stand.stand import Stand
 
 
 def unguarded(error: DeviceError) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from foundation.clock import Clock
-from foundation.events import RESTORED, SOAK_CREDITED, SOAK_RESTARTED
-from stand.running.executing.actions import Surroundings, worth_of_soaks
-from stand.running.memory.entries import Dwell, Restored
-from stand.running.memory.journal import Logbook
-from stand.running.memory.state import SetUp
-from stand.stand import Stand
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.events import RESTORED, SOAK_CREDITED, SOAK_RESTARTED
+from thermostand.stand.running.executing.actions import Surroundings, worth_of_soaks
+from thermostand.stand.running.memory.entries import Dwell, Restored
+from thermostand.stand.running.memory.journal import Logbook
+from thermostand.stand.running.memory.state import SetUp
+from thermostand.stand.stand import Stand
 
 
 async def restore(

@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.steps import PlannedStep, SoakUntilSettled
-from foundation.calls import Lane
-from foundation.clock import Clock, seconds_ns
-from foundation.events import NOT_SETTLED, SETTLED
-from foundation.hub import Hub
-from foundation.items import Batch, Item
-from foundation.readings import Frame, Reading
-from markers.target import Target
-from stand.estimating.chamber_model import BAND_K
-from stand.imaging.settling import Float, Seen, digit_K, judge, movement, seconds
-from stand.stand import Stand
+from thermostand.experiments.steps import PlannedStep, SoakUntilSettled
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.events import NOT_SETTLED, SETTLED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Item
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.markers.target import Target
+from thermostand.stand.estimating.chamber_model import BAND_K
+from thermostand.stand.imaging.settling import Float, Seen, digit_K, judge, movement, seconds
+from thermostand.stand.stand import Stand
 
 if TYPE_CHECKING:
-    from markers.detection import Detection
+    from thermostand.markers.detection import Detection
 
 CHAMBER, CAMERA = "regulator.pv", "camera.temperature"
 _UNKNOWN_S = 60.0
@@ -33,7 +33,7 @@ _KEPT = 20_000  # readings, at least: more than a day at one every 5 s
 def load_for(plan: Iterable[PlannedStep]) -> None:
     """Import what looks need, when the plan has any: in the run that would hold the guard's loop for a second."""
     if any(isinstance(planned.step, SoakUntilSettled) for planned in plan):
-        importlib.import_module("markers.detection")
+        importlib.import_module("thermostand.markers.detection")
 
 
 class SettlingWatch:
@@ -112,7 +112,7 @@ class SettlingWatch:
 
     def _find(self, frame: Frame) -> None:
         """In the lane: the markers, and how far they have moved since the look before."""
-        from markers.detection import DetectionError, detect  # see load_for
+        from thermostand.markers.detection import DetectionError, detect  # see load_for
 
         try:
             found = detect(frame.image, self._target, self._before)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from experiments.steps import AnySoak, PlannedStep, Soak
-from foundation.clock import NS_PER_S, Clock, seconds_ns
-from foundation.errors import DeviceFault
-from foundation.events import SOAK_LONGER, SOAK_UNSETTLED
-from foundation.tasks import first_of
-from stand.gate import Gate
-from stand.running.executing.settling_watch import SettlingWatch
-from stand.running.memory.entries import Dwell
-from stand.running.memory.journal import Logbook
-from stand.running.memory.state import RunState, duration_of
+from thermostand.experiments.steps import AnySoak, PlannedStep, Soak
+from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.errors import DeviceFault
+from thermostand.foundation.events import SOAK_LONGER, SOAK_UNSETTLED
+from thermostand.foundation.tasks import first_of
+from thermostand.stand.gate import Gate
+from thermostand.stand.running.executing.settling_watch import SettlingWatch
+from thermostand.stand.running.memory.entries import Dwell
+from thermostand.stand.running.memory.journal import Logbook
+from thermostand.stand.running.memory.state import RunState, duration_of
 
 _JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
 

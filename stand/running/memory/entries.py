@@ -35,10 +35,10 @@ from typing import Literal, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from experiments.steps import Step as PlanStep
-from foundation.document_faults import path_text
-from foundation.errors import SessionError
-from recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.experiments.steps import Step as PlanStep
+from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.journal_lines import JOURNAL_NAME
 
 
 @dataclass(frozen=True, slots=True)

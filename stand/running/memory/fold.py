@@ -13,16 +13,16 @@ from dataclasses import replace
 from functools import reduce
 from types import MappingProxyType
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     AnySoak,
     PlannedStep,
     PowerCamera,
     number_steps,
     step_of,
 )
-from foundation.clock import seconds_ns
-from stand.gate import INTERLOCK
-from stand.running.memory.entries import (
+from thermostand.foundation.clock import seconds_ns
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.running.memory.entries import (
     Again,
     Change,
     Cleared,
@@ -42,7 +42,7 @@ from stand.running.memory.entries import (
     Taken,
     Tripped,
 )
-from stand.running.memory.state import RunState, SetUp
+from thermostand.stand.running.memory.state import RunState, SetUp
 
 
 def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:

@@ -16,15 +16,15 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
-from foundation.calls import Lane, Line
-from foundation.clock import Clock
-from foundation.errors import NotThere, SessionError
-from foundation.events import JOURNAL_NOT_SAVED, EventKind
-from foundation.files import replace_file, sync_folder
-from foundation.hub import Hub
-from foundation.patience import Patience
-from recording.format.layout import TELEMETRY
-from recording.reading.journal_lines import (
+from thermostand.foundation.calls import Lane, Line
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import NotThere, SessionError
+from thermostand.foundation.events import JOURNAL_NOT_SAVED, EventKind
+from thermostand.foundation.files import replace_file, sync_folder
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.patience import Patience
+from thermostand.recording.format.layout import TELEMETRY
+from thermostand.recording.reading.journal_lines import (
     JOURNAL_NAME,
     LIMIT_BYTES,
     damage_text,
@@ -32,14 +32,14 @@ from recording.reading.journal_lines import (
     lines_of,
     mark_of,
 )
-from recording.writing.disk import JOURNAL_LINE, Disk
-from recording.writing.home import FolderLost
-from recording.writing.locks import lock
-from stand.fault import Fault
-from stand.gate import HELD, IN_WORDS, INTERLOCK, RELEASED, STOPPING
-from stand.running.memory.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encoded
-from stand.running.memory.fold import after
-from stand.running.memory.state import RunState
+from thermostand.recording.writing.disk import JOURNAL_LINE, Disk
+from thermostand.recording.writing.home import FolderLost
+from thermostand.recording.writing.locks import lock
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import HELD, IN_WORDS, INTERLOCK, RELEASED, STOPPING
+from thermostand.stand.running.memory.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encoded
+from thermostand.stand.running.memory.fold import after
+from thermostand.stand.running.memory.state import RunState
 
 _END_WITHIN_S, _COMPLETE_WITHIN_S = 1.0, 10.0  # real seconds that a disk may take for the last entry
 _DAMAGED = ".damaged"  # the ending of the copy of a journal with damaged lines

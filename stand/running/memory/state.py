@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from experiments.steps import (
+from thermostand.experiments.steps import (
     AnySoak,
     Capture,
     CloseFlap,
@@ -24,9 +24,9 @@ from experiments.steps import (
     StartChamber,
     StopChamber,
 )
-from foundation.clock import NS_PER_S, seconds_ns
-from stand.running.memory.entries import Change, Edited, Ended
-from stand.running.memory.ids import Ids
+from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.stand.running.memory.entries import Change, Edited, Ended
+from thermostand.stand.running.memory.ids import Ids
 
 Plan = tuple[PlannedStep, ...]
 

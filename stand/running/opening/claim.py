@@ -24,11 +24,11 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple, cast
 
-from foundation.addresses import SerialPlace, place_of
-from foundation.errors import InUse, SessionError
-from foundation.lock_file import remove, take, try_lock
-from stand.config.stand_config import StandConfig
-from stand.serving.presence import STANDS_FOLDER, lock_folder, runtime_folder, runtime_folders
+from thermostand.foundation.addresses import SerialPlace, place_of
+from thermostand.foundation.errors import InUse, SessionError
+from thermostand.foundation.lock_file import remove, take, try_lock
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.serving.presence import STANDS_FOLDER, lock_folder, runtime_folder, runtime_folders
 
 
 class Address(NamedTuple):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from foundation.clock import NS_PER_S, PIECE_S, WallClock, seconds_ns
-from foundation.events import HOST_SUSPENDED
-from foundation.hub import Hub
-from foundation.instants import duration
-from recording.format.utc_offsets import REPEATED_NS, offset_event, step_event
+from thermostand.foundation.clock import NS_PER_S, PIECE_S, WallClock, seconds_ns
+from thermostand.foundation.events import HOST_SUSPENDED
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.instants import duration
+from thermostand.recording.format.utc_offsets import REPEATED_NS, offset_event, step_event
 
 _PERIOD_S = PIECE_S
 _LIMIT_NS = seconds_ns(1.0)

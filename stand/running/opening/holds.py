@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError, NotCleared, StandError
-from foundation.events import COMMAND, FLAP_NOT_SHUT, FLAP_SHUT_IN_HOLD
-from foundation.hub import Hub
-from foundation.items import Event, Item
-from foundation.tasks import first_of
-from stand.fault import Fault
-from stand.gate import STOPPING, Gate
-from stand.stand import Stand
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError, NotCleared, StandError
+from thermostand.foundation.events import COMMAND, FLAP_NOT_SHUT, FLAP_SHUT_IN_HOLD
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item
+from thermostand.foundation.tasks import first_of
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import STOPPING, Gate
+from thermostand.stand.stand import Stand
 
 # Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.
 SHUT_AFTER_S = 48.0

@@ -11,26 +11,26 @@ from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Protocol, TypeVar
 
-from foundation.clock import VirtualClock, WallClock
-from foundation.errors import DeviceFault, StandError, Unreachable
-from foundation.events import LATCH_NOT_CLEARED, LATCH_NOT_KEPT
-from foundation.hub import Hub
-from foundation.patience import Patience
-from foundation.repeats import RepeatLimit
-from foundation.tasks import cancelled, watched
-from recording.writing.disk import FILES_LINE, LATCH_LINE, Disk
-from stand.assembly import Assembly, assemble
-from stand.config.stand_config import StandConfig
-from stand.fault import Fault
-from stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
-from stand.guarding.guard import Guard
-from stand.guarding.interlocks import Recording
-from stand.guarding.rules import Announcements
-from stand.poller import Poller
-from stand.running.opening.claim import claimed
-from stand.running.opening.holds import keep_shut_in_holds
-from stand.running.opening.stand_latch import StandLatch
-from stand.running.opening.stop import Stop
+from thermostand.foundation.clock import VirtualClock, WallClock
+from thermostand.foundation.errors import DeviceFault, StandError, Unreachable
+from thermostand.foundation.events import LATCH_NOT_CLEARED, LATCH_NOT_KEPT
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.repeats import RepeatLimit
+from thermostand.foundation.tasks import cancelled, watched
+from thermostand.recording.writing.disk import FILES_LINE, LATCH_LINE, Disk
+from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
+from thermostand.stand.guarding.guard import Guard
+from thermostand.stand.guarding.interlocks import Recording
+from thermostand.stand.guarding.rules import Announcements
+from thermostand.stand.poller import Poller
+from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.opening.holds import keep_shut_in_holds
+from thermostand.stand.running.opening.stand_latch import StandLatch
+from thermostand.stand.running.opening.stop import Stop
 
 _OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
 

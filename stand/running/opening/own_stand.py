@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from drivers.settings import CameraSettings, OnBus
-from foundation.errors import ConfigError
-from stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.drivers.settings import CameraSettings, OnBus
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 
 # Of the camera and the recording: frames before and after the interruption belong together.
 _CAMERA = (

@@ -16,12 +16,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from foundation.errors import SessionError
-from foundation.files import replace_file, sync_folder
-from foundation.sealed import seal, unseal
-from stand.config.stand_config import StandConfig
-from stand.fault import Fault
-from stand.running.opening.claim import addresses, file_name
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.files import replace_file, sync_folder
+from thermostand.foundation.sealed import seal, unseal
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.fault import Fault
+from thermostand.stand.running.opening.claim import addresses, file_name
 
 SYSTEM_FOLDER = Path("/var/lib/thermostand")
 UNREADABLE = "latch_unreadable"

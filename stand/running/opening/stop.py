@@ -6,11 +6,11 @@ import asyncio
 import signal
 from collections.abc import Callable
 
-from foundation.errors import Interrupted, SessionError, StandTripped
-from foundation.patience import Patience
-from stand.fault import Fault
-from stand.gate import Gate, Phase, Turn, next_phase
-from stand.stand import Stand
+from thermostand.foundation.errors import Interrupted, SessionError, StandTripped
+from thermostand.foundation.patience import Patience
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import Gate, Phase, Turn, next_phase
+from thermostand.stand.stand import Stand
 
 STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
 STOPPED = Fault(STOPPED_BY_OPERATOR, "stopped by the operator")

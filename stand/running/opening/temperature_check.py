@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from drivers.devices.protocols import Camera
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import Refused
-from foundation.events import NO_CAMERA_TEMPERATURE
-from foundation.hub import Hub
-from foundation.readings import Quality
+from thermostand.drivers.devices.protocols import Camera
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import Refused
+from thermostand.foundation.events import NO_CAMERA_TEMPERATURE
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.readings import Quality
 
 _TRIES, _PAUSE_S = 3, 1.0
 

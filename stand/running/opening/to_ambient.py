@@ -9,16 +9,16 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 
-from foundation.clock import Clock, seconds_ns
-from foundation.errors import DeviceError
-from foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, TO_AMBIENT
-from foundation.hub import Hub
-from stand.config.stand_config import StandConfig
-from stand.fault import value_of
-from stand.gate import INTERLOCK
-from stand.guarding.rules import AIR, LABORATORY, cold_parts, dew_limit_degC
-from stand.interlock import Interlocked
-from stand.stand import Stand
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import DeviceError
+from thermostand.foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, TO_AMBIENT
+from thermostand.foundation.hub import Hub
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.fault import value_of
+from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.guarding.rules import AIR, LABORATORY, cold_parts, dew_limit_degC
+from thermostand.stand.interlock import Interlocked
+from thermostand.stand.stand import Stand
 
 _LOOK_S = 10.0
 _AGAIN_S = 60.0  # after a device that did not do what was commanded

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 
-from foundation.clock import NS_PER_S
-from stand.fault import Fault
-from stand.guarding.interlocks import RECORDING_ENDED
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.fault import Fault
+from thermostand.stand.guarding.interlocks import RECORDING_ENDED
 
 MOST_PER_H = 3
 """A kernel that is short of memory kills once or twice; what is killed more often has a cause that stays."""

@@ -29,11 +29,11 @@ from http import HTTPStatus
 from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
-from stand.config.interface_section import TokenFile
-from stand.serving.api.pace import Pace
-from stand.serving.api.stream import json_of
-from stand.serving.api.token_book import TokenBook
-from stand.serving.desk import Who
+from thermostand.stand.config.interface_section import TokenFile
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.api.stream import json_of
+from thermostand.stand.serving.api.token_book import TokenBook
+from thermostand.stand.serving.desk import Who
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]

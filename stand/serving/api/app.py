@@ -11,17 +11,17 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from foundation.document_faults import path_text
-from foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
-from stand.serving.api.access import FAILED, Access, App, Gatekeeper
-from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.api.doors import Interface
-from stand.serving.api.order_routes import commands
-from stand.serving.api.pace import Pace
-from stand.serving.api.reads import reads
-from stand.serving.api.recorded import recorded
-from stand.serving.api.stream import Stream, json_of
-from stand.serving.desk import Conflict, Missing
+from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
+from thermostand.stand.serving.api.access import FAILED, Access, App, Gatekeeper
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.order_routes import commands
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.api.reads import reads
+from thermostand.stand.serving.api.recorded import recorded
+from thermostand.stand.serving.api.stream import Stream, json_of
+from thermostand.stand.serving.desk import Conflict, Missing
 
 # What was raised -> the answer's status; the first that fits.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (

@@ -19,14 +19,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar
 
-from foundation.clock import Clock, WallClock, utc_offset_ns
-from foundation.events import COMMAND
-from foundation.hub import Hub
-from foundation.items import Event, Item, Original, StepMark
-from foundation.readings import Frame
-from foundation.tasks import failure_text
-from stand.serving.desk import Desk, Done, PlanStep, StandState, Who, WrittenStep
-from stand.serving.plan_faults import PlanCheck
+from thermostand.foundation.clock import Clock, WallClock, utc_offset_ns
+from thermostand.foundation.events import COMMAND
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event, Item, Original, StepMark
+from thermostand.foundation.readings import Frame
+from thermostand.foundation.tasks import failure_text
+from thermostand.stand.serving.desk import Desk, Done, PlanStep, StandState, Who, WrittenStep
+from thermostand.stand.serving.plan_faults import PlanCheck
 
 _REFRESH_S = 0.5
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from foundation.errors import ConfigError
-from stand.serving.api.access import is_loopback
-from stand.serving.api.bridge import Bridge
-from stand.serving.api.pace import Pace
-from stand.serving.api.token_book import TokenBook
+from thermostand.foundation.errors import ConfigError
+from thermostand.stand.serving.api.access import is_loopback
+from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.api.token_book import TokenBook
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,9 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from uvicorn.server import ServerState
 from websockets.frames import CloseCode
 
-from stand.serving.api.access import last_refusal, uid_of
-from stand.serving.api.pace import Pace
-from stand.serving.api.stop_thread import Others, is_readable
+from thermostand.stand.serving.api.access import last_refusal, uid_of
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.api.stop_thread import Others, is_readable
 
 MOST_CLIENTS = 64  # a script that leaks connections must not take the files the recording needs
 _MOST_ASKING = 96  # when all of them wait for an answer

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from stand.serving.api.bridge import Snapshot
-from stand.serving.desk import StandState
+from thermostand.stand.serving.api.bridge import Snapshot
+from thermostand.stand.serving.desk import StandState
 
 _PHASES = ("idle", "running", "held", "stopping")
 _Sample = tuple[Mapping[str, str], float]

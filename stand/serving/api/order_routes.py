@@ -7,11 +7,11 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Path, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
 
-from foundation.documents import Document
-from recording.reading.notes import LONGEST_NOTE
-from stand.serving.api.access import STOP_PATH
-from stand.serving.api.bridge import Bridge
-from stand.serving.desk import (
+from thermostand.foundation.documents import Document
+from thermostand.recording.reading.notes import LONGEST_NOTE
+from thermostand.stand.serving.api.access import STOP_PATH
+from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.desk import (
     DeviceState,
     Done,
     FaultRequest,
@@ -23,7 +23,7 @@ from stand.serving.desk import (
     Who,
     WrittenStep,
 )
-from stand.serving.plan_faults import PlanCheck
+from thermostand.stand.serving.plan_faults import PlanCheck
 
 _Id = Annotated[int, Path(ge=1, le=1 << 53)]
 _Name = Annotated[str, Path(max_length=255)]

@@ -10,13 +10,13 @@ from fastapi import APIRouter, Query, Request, Response, WebSocket
 from pydantic import BaseModel, Field
 from starlette.websockets import WebSocketDisconnect
 
-from experiments.steps import schema_of_steps
-from foundation.documents import Document
-from stand.serving.api.access import COOKIE, INVITE_PATH, LOGIN_PATH, Access
-from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.api.metrics import metrics
-from stand.serving.api.stream import EVENTS, MOST_VIEWERS, Stream, json_of
-from stand.serving.desk import PlanStep, StandState, Who
+from thermostand.experiments.steps import schema_of_steps
+from thermostand.foundation.documents import Document
+from thermostand.stand.serving.api.access import COOKIE, INVITE_PATH, LOGIN_PATH, Access
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
+from thermostand.stand.serving.api.metrics import metrics
+from thermostand.stand.serving.api.stream import EVENTS, MOST_VIEWERS, Stream, json_of
+from thermostand.stand.serving.desk import PlanStep, StandState, Who
 
 _OLD_S = 10.0  # a snapshot is made twice a second: the control loop hangs
 _SEND_LIMIT_S = 30.0

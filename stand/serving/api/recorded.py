@@ -13,13 +13,13 @@ from fastapi import APIRouter, Response
 from fastapi import Path as FromPath
 from pydantic import BaseModel
 
-from foundation.errors import SessionError
-from recording.format.inventory import inventory
-from recording.reading.catalogue import Entry, Memory, catalogue, look_at
-from stand.config.recipe import Recipe
-from stand.config.stand_config import packaged
-from stand.serving.api.bridge import Bridge, NoAnswer
-from stand.serving.desk import Missing
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.inventory import inventory
+from thermostand.recording.reading.catalogue import Entry, Memory, catalogue, look_at
+from thermostand.stand.config.recipe import Recipe
+from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
+from thermostand.stand.serving.desk import Missing
 
 REPORT = "report.html"
 # A report is a page of its own with styles and drawings in it: nothing in it may run, or ask this stand anything.

@@ -15,19 +15,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from foundation.clock import Clock
-from foundation.errors import ConfigError, SessionError, StandError
-from foundation.events import INTERFACE_FAILED, NO_CONTROL, EventKind
-from foundation.hub import Hub
-from foundation.patience import Patience
-from foundation.tasks import failure_text
-from stand.serving.api.access import Access
-from stand.serving.api.bridge import Bridge
-from stand.serving.api.doors import Interface, OtherDoor
-from stand.serving.api.pace import Pace
-from stand.serving.api.stop_thread import StopThread
-from stand.serving.desk import Desk
-from stand.serving.presence import Entry, Presence
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.errors import ConfigError, SessionError, StandError
+from thermostand.foundation.events import INTERFACE_FAILED, NO_CONTROL, EventKind
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.patience import Patience
+from thermostand.foundation.tasks import failure_text
+from thermostand.stand.serving.api.access import Access
+from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.api.doors import Interface, OtherDoor
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.api.stop_thread import StopThread
+from thermostand.stand.serving.desk import Desk
+from thermostand.stand.serving.presence import Entry, Presence
 
 _LOOK_S = 1.0
 _CLOSE_LIMIT_S = 5.0
@@ -99,7 +99,7 @@ def preload() -> None:
 
     def load() -> None:
         for name in ("app", "listening"):
-            importlib.import_module(f"stand.serving.api.{name}")
+            importlib.import_module(f"thermostand.stand.serving.api.{name}")
 
     threading.Thread(target=load, name="interface-imports", daemon=True).start()
 
@@ -126,7 +126,7 @@ def _tcp_doors(interface: Interface) -> dict[str, socket.socket]:
 
 
 def _tcp(option: str, host: str, port: int) -> socket.socket:
-    from stand.serving.api.listening import listening_at
+    from thermostand.stand.serving.api.listening import listening_at
 
     try:
         return listening_at(host, port)
@@ -196,9 +196,9 @@ class _Thread:
 
     async def _main(self) -> None:
         # Imported here: nothing else of the program needs them, and they take half a second.
-        from stand.serving.api.app import make_app
-        from stand.serving.api.listening import Listening
-        from stand.serving.api.stream import Stream
+        from thermostand.stand.serving.api.app import make_app
+        from thermostand.stand.serving.api.listening import Listening
+        from thermostand.stand.serving.api.stream import Stream
 
         pace, stream = Pace(), Stream(self._bridge)
         app = make_app(self._bridge, stream, self._access, pace, self._interface, self._failed)

@@ -21,10 +21,19 @@ from typing import Literal
 
 import h11
 
-from stand.serving.api.access import FAILED, STOP_PATH, Access, Denied, Scope, last_answer, last_refusal, uid_of
-from stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, no_answer
-from stand.serving.api.pace import Pace
-from stand.serving.desk import Done, Who
+from thermostand.stand.serving.api.access import (
+    FAILED,
+    STOP_PATH,
+    Access,
+    Denied,
+    Scope,
+    last_answer,
+    last_refusal,
+    uid_of,
+)
+from thermostand.stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, no_answer
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.desk import Done, Who
 
 Door = Literal["stop", "tcp"]
 Stopping = Callable[[Who], "concurrent.futures.Future[Done]"]

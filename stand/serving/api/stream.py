@@ -17,10 +17,10 @@ from typing import Literal
 
 from pydantic_core import to_json
 
-from foundation.items import Batch, Event, Item, Original, StepMark
-from foundation.readings import Frame, Quality, Reading
-from stand.serving.api.bridge import Bridge, Snapshot
-from stand.serving.desk import StandState
+from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
+from thermostand.foundation.readings import Frame, Quality, Reading
+from thermostand.stand.serving.api.bridge import Bridge, Snapshot
+from thermostand.stand.serving.desk import StandState
 
 EVENTS = 5_000  # kept for those who reconnect: days
 READINGS = 3_000  # batches: some minutes; the page's history has the rest

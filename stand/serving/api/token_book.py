@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 
-from stand.config.interface_section import TokenFile
+from thermostand.stand.config.interface_section import TokenFile
 
 
 class TokenBook:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from pydantic import JsonValue
 
-from stand.serving.secop.secop_lines import Refusal
+from thermostand.stand.serving.secop.secop_lines import Refusal
 
 DataInfo = Mapping[str, JsonValue]
 TEXT_LIMIT = 200

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from pydantic import JsonValue
 
-from stand.estimating.chamber_model import BAND_K
-from stand.serving.desk import DeviceState, ReadingState, RunRequest, RunStatus, StandState
-from stand.serving.secop import datainfo
-from stand.serving.secop.modules import (
+from thermostand.stand.estimating.chamber_model import BAND_K
+from thermostand.stand.serving.desk import DeviceState, ReadingState, RunRequest, RunStatus, StandState
+from thermostand.stand.serving.secop import datainfo
+from thermostand.stand.serving.secop.modules import (
     BUSY,
     DRIVE_CODES,
     ERROR,
@@ -28,7 +28,7 @@ from stand.serving.secop.modules import (
     measured,
     status,
 )
-from stand.serving.secop.secop_lines import Refusal
+from thermostand.stand.serving.secop.secop_lines import Refusal
 
 CHAMBER, RUN = "chamber", "run"
 _CLOSED, _OPEN, _MOVING = 0, 1, 2

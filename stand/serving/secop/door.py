@@ -13,11 +13,11 @@ import socket
 from collections import deque
 from collections.abc import Callable
 
-from stand.serving.api.bridge import Bridge
-from stand.serving.api.doors import OtherDoor
-from stand.serving.api.pace import Pace
-from stand.serving.secop.node import Node, Place
-from stand.serving.secop.secop_lines import (
+from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.api.doors import OtherDoor
+from thermostand.stand.serving.api.pace import Pace
+from thermostand.stand.serving.secop.node import Node, Place
+from thermostand.stand.serving.secop.secop_lines import (
     ANSWERS,
     IDENTIFY,
     LINE_LIMIT_BYTES,

@@ -8,10 +8,10 @@ from typing import Literal
 
 from pydantic import JsonValue
 
-from stand.serving.desk import Desk, Done, QueuedRun, ReadingState, StandState, Who
-from stand.serving.secop import datainfo
-from stand.serving.secop.datainfo import DataInfo
-from stand.serving.secop.secop_lines import Refusal
+from thermostand.stand.serving.desk import Desk, Done, QueuedRun, ReadingState, StandState, Who
+from thermostand.stand.serving.secop import datainfo
+from thermostand.stand.serving.secop.datainfo import DataInfo
+from thermostand.stand.serving.secop.secop_lines import Refusal
 
 # Codes of a status (specification, "status"); BUSY is 300 to 399.
 IDLE, WARN, BUSY, RAMPING, ERROR = 100, 200, 300, 370, 400

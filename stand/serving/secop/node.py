@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from pydantic import JsonValue
 
-from foundation.clock import NS_PER_S
-from foundation.errors import (
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import (
     ConfigError,
     DeviceError,
     DeviceFault,
@@ -22,12 +22,12 @@ from foundation.errors import (
     StandTripped,
     Unreachable,
 )
-from stand.serving.api.bridge import Bridge, NoAnswer, Snapshot
-from stand.serving.desk import Conflict, Desk, DeviceState, Done, QueuedRun, StandState, Who
-from stand.serving.secop.datainfo import taken
-from stand.serving.secop.devices import modules
-from stand.serving.secop.modules import Command, Drive, Known, Module, Order, Report, Seen
-from stand.serving.secop.secop_lines import (
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, Snapshot
+from thermostand.stand.serving.desk import Conflict, Desk, DeviceState, Done, QueuedRun, StandState, Who
+from thermostand.stand.serving.secop.datainfo import taken
+from thermostand.stand.serving.secop.devices import modules
+from thermostand.stand.serving.secop.modules import Command, Drive, Known, Module, Order, Report, Seen
+from thermostand.stand.serving.secop.secop_lines import (
     ANSWERS,
     IDENTIFICATION,
     IDENTIFY,
