@@ -7,7 +7,6 @@ import sys
 from thermostand.foundation.usage import Lazy, lazy_app
 
 _APPLY, _FIT = "thermostand.compensation.commands.apply_cli", "thermostand.compensation.commands.fit_cli"
-_FEW = "thermostand.compensation.commands.few_frames_cli"
 
 
 app = lazy_app(
@@ -22,8 +21,7 @@ app = lazy_app(
         "datasheet": Lazy(
             "thermostand.compensation.commands.datasheet_cli", "Write a camera's thermal datasheet, with uncertainties."
         ),
-        "fit-like": Lazy(_FEW, "Fit a new unit of a camera type to few frames."),
-        "anchor": Lazy(_FEW, "Fit a model to where the target is in a new session."),
+        "anchor": Lazy(_FIT, "Fit a model to where the target is in a new session."),
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
         "export": Lazy(_APPLY, "Write the model for other programs: in Python with numpy only, in C, for ROS 2."),
         "calibrate": Lazy(

@@ -1,4 +1,4 @@
-"""`compensate fit` and `compensate report`: the drift of sessions of one camera."""
+"""`compensate fit`, `anchor` and `report`: the drift of sessions of one camera."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from thermostand.compensation.centres_table import observations_of_table
 from thermostand.compensation.commands.budget_cli import budgets_of_sessions
 from thermostand.compensation.commands.options import CameraName, DetailsOption, Finding, named_target
 from thermostand.compensation.datasheet.details import load_details
+from thermostand.compensation.drift.anchoring import anchored, thermal_of
 from thermostand.compensation.drift.bump import Bump
 from thermostand.compensation.drift.choosing import Form, check_request
 from thermostand.compensation.drift.choosing import fit as fit_model
@@ -19,6 +20,7 @@ from thermostand.compensation.drift.evaluation import Evaluation, evaluate, tabl
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.paper_model import MAX_DEGREE
 from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.type_prior import fit_like
 from thermostand.compensation.drift.unrepeated import Cause, find_unrepeated
 from thermostand.compensation.observations import Observations
 from thermostand.compensation.reporting.drawing.drawing import drawing
@@ -61,6 +63,10 @@ def fit(
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
     form: FormOption = None,
     degree: DegreeOption = None,
+    like: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="MODEL", help="A model of another unit of its type; of three or more."),
+    ] = None,
     camera: CameraName = None,
     *,
     finding: Finding,
@@ -74,15 +80,21 @@ def fit(
     by 20 mpx and more on another one. What that adds is assumed then, and the model says so; two nights over the same
     set-points, in another order, measure it.
 
+    With --like few frames are enough, at two temperatures or more: a warm-up, the reference and a set-point on each
+    side of it, 14 and 45 degC say, teach more than a hot one alone.
+
     Example: compensate fit sessions/20260101T180000Z-thermal-cycle -o model.json
     """
     check_request(degree, form)
     check_writable(out)
+    if like and (form == "paper" or degree is not None):
+        raise ConfigError("--like fits the thermal form, which has no degree; leave out --form and --degree")
+    units = [thermal_of(load_model(path)) for path in like or ()]
     if any(path.suffix.lower() == ".csv" for path in sessions):
         observations = _of_table(sessions)
     else:
         observations = finding.observed(sessions, camera)
-    model = fit_model(observations, degree, form, say)
+    model = fit_like(observations, units) if units else fit_model(observations, degree, form, say)
     evaluation, unscored = _scored(model, observations)
     save_model(model, out)
     bumps = list(model.facts.bumps)
@@ -98,6 +110,29 @@ def fit(
     left_out = [f"{count} frames are left out: {reason}" for reason, count in observations.left_out.items()]
     lines = [f"{model.form}: {model.title}", *left_out, *stepped, scored]
     show({**data, "left_out": observations.left_out, "unrepeated": named, "between_nights": repeats, **scores}, lines)
+
+
+@app.command()
+def anchor(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")],
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session, with a few reference frames.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write, for this session.")],
+    camera: CameraName = None,
+    *,
+    finding: Finding,
+) -> None:
+    """Fit a model to where the target is in a new session, with a few reference frames of the session itself.
+
+    Camera or target were taken out since the model was fitted: what that moved is the same in all states, and is taken
+    out, with its uncertainty. The new model has the thermal form alone.
+
+    Example: compensate anchor model.json sessions/20260108T180000Z-short -o model-of-the-8th.json
+    """
+    check_writable(out)
+    known = thermal_of(load_model(model))
+    found = anchored(known, finding.observed([session], camera))
+    save_model(found, out)
+    show({"model": out, "form": found.form, "title": found.title}, [f"{found.form}: {found.title}"])
 
 
 def _scored(model: DriftModel, observations: Observations) -> tuple[Evaluation | None, str]:

@@ -15,7 +15,7 @@ from thermostand.foundation.errors import ConfigError, StandError
 from thermostand.foundation.progress import progress
 
 MODEL_NAME, REPORT_NAME = "model.json", "report.html"
-DECIDES = process.__name__  # the module of the process that decides, which imports the rest when it is asked
+DECIDES = process.decided  # for a process of its own, which imports the rest when it is asked
 
 
 class Reported(NamedTuple):

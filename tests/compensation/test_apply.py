@@ -212,8 +212,9 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
         assert ("reference frames of its own: `compensate anchor`" in said) == is_offered
     refused = run("anchor", files["paper"], recorded.path, "-o", tmp_path / "none.json", status=1)
     assert "the model has no thermal form" in refused
-    refused = run("fit-like", recorded.path, *2 * [files["thermal"]], "-o", tmp_path / "none.json", status=1)
-    assert "a type is known by 3 units or more" in refused
+    few = "fit", recorded.path, *2 * ["--like", files["thermal"]], "-o", tmp_path / "none.json"
+    assert "a type is known by 3 units or more" in run(*few, status=1)
+    assert "leave out --form" in run(*few, "--form", "paper", status=2)
 
 
 def test_a_session_is_corrected_with_the_form_in_use_and_so_is_an_export(

@@ -5,13 +5,15 @@ import json
 import os
 import signal
 import threading
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 LEFT_NAME = "test-left"
 ANSWERS, ASKED = "answers.json", "asked.jsonl"
 
 
-def decided(session, asked):
+def decided(session: str, asked: Mapping[str, Any]) -> Any:
     with (Path(session) / ASKED).open("a") as file:
         file.write(json.dumps(asked) + "\n")
     found = json.loads((Path(session) / ANSWERS).read_text())[len((Path(session) / ASKED).read_text().splitlines()) - 1]

@@ -169,11 +169,11 @@ class SmallStand:
 
 class Life:
     """One daemon, from its start to its death; what it leaves is in `folder`, and what it recorded in `disk`. decides:
-    the module of the process that makes the plan's decisions. follows: the chamber is always at its set-point, and says
+    makes the plan's decisions, in a process of its own. follows: the chamber is always at its set-point, and says
     so. gap: that after which it is begun. meet: gets a device error that a step has met."""
 
     def __init__(
-        self, folder: Path, plan, start_ns, disk, chamber_degC, decides="", *, follows=False, gap=None, meet=unguarded
+        self, folder: Path, plan, start_ns, disk, chamber_degC, decides=None, *, follows=False, gap=None, meet=unguarded
     ):
         self.loop = asyncio.new_event_loop()
         self.wrong = []

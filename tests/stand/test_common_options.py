@@ -152,7 +152,6 @@ OF_A_SESSION = {
     "compensate budget": "",
     "compensate apply": "nowhere -o p.csv",
     "compensate anchor": "nowhere -o b.json",
-    "compensate fit-like": "nowhere -o n.json",
 }
 
 

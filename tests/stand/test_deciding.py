@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.journals import read_lines
-from tests.stand.decisions_process import ANSWERS, ASKED
+from tests.stand.decisions_process import ANSWERS, ASKED, decided
 from tests.stand.small_stand import Life
 from thermostand.experiments.known import Enough, Undecided, Visit, after_decision, fixed_visits
 from thermostand.experiments.parameters import Known
@@ -61,7 +61,7 @@ def life(tmp_path: Path):
     def begin(*answers: object, start_ns: int = START_NS) -> Life:
         if answers:
             (tmp_path / ANSWERS).write_text(json.dumps(answers))
-        begun = Life(tmp_path, PLAN, start_ns, disk, 24.0, "tests.stand.decisions_process", follows=True)
+        begun = Life(tmp_path, PLAN, start_ns, disk, 24.0, decided, follows=True)
         begun.reported = []
         begun.hub.subscribe(begun.reported.append)
         lives.append(begun)
@@ -155,10 +155,10 @@ def test_without_decisions_the_fixed_plan_goes_on_and_it_is_said(life: Callable[
 
 async def test_a_late_decision_is_not_waited_for(tmp_path: Path):
     (tmp_path / ANSWERS).write_text('["hang"]')
-    decider = Decider(tmp_path, WallClock(), "tests.stand.decisions_process")
-    decided = await decider.decide(replace(DECIDE, wait_s=0.5))
-    assert isinstance(decided.answer, Undecided)
-    assert decided.reason == "the drift model was not fitted within 0.5 s"
+    decider = Decider(tmp_path, WallClock(), decided)
+    found = await decider.decide(replace(DECIDE, wait_s=0.5))
+    assert isinstance(found.answer, Undecided)
+    assert found.reason == "the drift model was not fitted within 0.5 s"
 
 
 def total_s(steps: tuple[Step, ...]) -> float:

@@ -8,9 +8,8 @@ leaves the fixed plan, and the change says so.
 from __future__ import annotations
 
 import asyncio
-import importlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,10 @@ from thermostand.foundation.helper import Helper
 from thermostand.stand.running.memory.entries import Edited, edited
 from thermostand.stand.running.memory.state import RunState
 
-_LINE, _KEPT = "design", "design"
+_LINE = "design"
+Decides = Callable[[str, Mapping[str, Any]], Mapping[str, Any]]
+"""A session's folder and the parameters of the plan's step -> kind, reason and, of a visit, chamber_degC and dwell_s.
+A function of a module that can be a process, see foundation/helper.py."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +43,12 @@ async def fixed_plan(decide: Decide) -> Decided:
 
 
 class Decider:
-    """Of the run whose session is in `directory`. module: of the process, which has `decided` (compensation/design/
-    process.py)."""
+    """Of the run whose session is in `directory`. decides: is called in a process of its own."""
 
-    def __init__(self, directory: Path, clock: Clock, module: str) -> None:
+    def __init__(self, directory: Path, clock: Clock, decides: Decides) -> None:
         self._directory = directory
         self._clock = clock
-        self._module = module
+        self._decides = decides
 
     async def decide(self, decide: Decide) -> Decided:
         """The decision, from what is on the disk; virtual time stands still meanwhile. A process that is killed (the
@@ -66,7 +67,7 @@ class Decider:
     async def _decided_by_process(self, decide: Decide) -> Decided:
         """BrokenPipeError when the process has ended."""
         try:
-            helper = Helper(self._module, (_LINE,), "the process that fits the drift model has ended")
+            helper = Helper(self._decides.__module__, (_LINE,), "the process that fits the drift model has ended")
         except OSError as error:
             return Decided(Undecided(), f"no process can be started that fits the drift model ({error.strerror})")
         lane = Lane("design", self._clock, patient=False)
@@ -78,9 +79,7 @@ class Decider:
 
     def _asked(self, helper: Helper, decide: Decide) -> Mapping[str, Any]:
         """In the lane."""
-        line = helper.line(_LINE)
-        line.make(_KEPT, importlib.import_module, self._module)
-        return line.call(_KEPT, "decided", str(self._directory), decide.parameters)
+        return helper.line(_LINE).run(self._decides, str(self._directory), decide.parameters)
 
 
 def _decided(found: Mapping[str, Any]) -> Decided:
