@@ -2,7 +2,7 @@
 
 Who has something to say publishes a row of this table: `DEVICE_BACK.at(now_ns, device="flap", lost_s=4.0)`. From the
 row come the line in the log (its text), what to type after it (`advice_for`), the message to people elsewhere
-(`alert_of`), whether a repetition may be withheld (`always_published`), and docs/troubleshooting. The guard's rules
+(`alert_of`), how often it is said (`ends`, `counts`: repeats.py), and docs/troubleshooting. The guard's rules
 (stand/guarding) register theirs with `guard_rule`; a package of experiments may add rows with `event`.
 """
 
@@ -63,7 +63,9 @@ class EventKind(str):
     level, advice and alert may depend on the data; `cases` are the data for which they differ. advice: what helps, or
     shows more, with `{folder}` for the session's; a warning or an error has one. counts: each one is published, as it
     begins or ends something that is counted, recorded or waited for. is_shown: `stand serve` prints it although it is
-    an information.
+    an information. ends: the kind whose state it ends, of the same `device`; is_ended: whether there is one that does;
+    foundation/repeats.py limits both together. is_limited: an information that is withheld when it repeats, as a
+    warning is.
     """
 
     level: Level | Callable[[Data], Level]
@@ -73,6 +75,9 @@ class EventKind(str):
     counts: bool
     is_shown: bool
     cases: tuple[Data, ...]
+    ends: str
+    is_ended: bool
+    is_limited: bool
 
     def at(self, time_ns: int, said: str = "", /, **data: object) -> Event:
         """One that has happened at that instant."""
@@ -126,6 +131,8 @@ def event(
     counts: bool = False,
     is_shown: bool = False,
     cases: tuple[Data, ...] = ({},),
+    ends: str = "",
+    is_limited: bool = False,
 ) -> EventKind:
     """One more row; see EventKind. ValueError when there is one of that name."""
     if name in KINDS:
@@ -133,6 +140,9 @@ def event(
     KINDS[name] = row = EventKind(name)
     row.level, row.text, row.advice, row.alert = level, text, advice, alert
     row.counts, row.is_shown, row.cases = counts, is_shown, cases
+    row.ends, row.is_ended, row.is_limited = ends, False, is_limited
+    if ends:
+        KINDS[ends].is_ended = True
     return row
 
 
@@ -172,10 +182,20 @@ def alert_of(event: Event) -> Alert | None:
     return row.alert_of(event.data)
 
 
-def always_published(event: Event) -> bool:
-    """Whether it begins or ends something: none of these may be withheld because it repeats."""
+def must_be_heard(event: Event) -> bool:
+    """Whether somebody has to act on it at once, or a run waits for it: it stays as grave as it is, however often."""
+    if event.data.get("action") in ("abort", "hold"):
+        return True
     row = KINDS.get(event.kind)
-    return (row is not None and row.counts) or event.data.get("action") in ("abort", "hold")
+    alert = row.alert_of(event.data) if row is not None and row.counts else None
+    return alert is not None and alert.phase == "raised"
+
+
+def state_of(event: Event) -> tuple[str, str] | None:
+    """The state that it begins or ends, and of which device it is; None when it is of another sort."""
+    row = KINDS.get(event.kind)
+    begins = "" if row is None else row.ends or (event.kind if row.is_ended else "")
+    return (begins, str(event.data.get("device", ""))) if begins else None
 
 
 # What is to be done, of more than one kind.
@@ -239,7 +259,8 @@ GUARD_LATE = event("guard_late", "warning",
     "the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up",
     "see what stopped or loads this computer; " + _SLEEP)
 SENSOR_BELIEVED = event("sensor_believed", "info",
-    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {doubted_s:.0f} s in doubt: {said}")
+    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {doubted_s:.0f} s in doubt: {said}",
+    is_limited=True)
 LATCH_NOT_KEPT = event("latch_not_kept", "error", "that the stand has tripped may be forgotten at a restart: {said}",
     "see that the folder of the stand's state is there and has room")
 LATCH_NOT_CLEARED = event("latch_not_cleared", "warning", "at a restart the stand is taken for tripped: {said}",
@@ -300,12 +321,13 @@ def _device(phase: Phase) -> Callable[[Data], Alert]:
     return lambda data: Alert("device_lost", str(data.get("device", "")), phase)
 
 
-DEVICE_LOST = event("device_lost", "warning", "{said}", CONNECTED, alert=_device("lasting"), counts=True)
-DEVICE_BACK = event("device_back", "info", "{device} answers again after {lost_s:g} s", alert=_device("over"))
+DEVICE_LOST = event("device_lost", "warning", "{said}", CONNECTED, alert=_device("lasting"))
+DEVICE_BACK = event("device_back", "info", "{device} answers again after {lost_s:g} s", alert=_device("over"),
+    ends=DEVICE_LOST)
 DEVICE_SLOW = event("device_slow", "warning",
     "{device} took {took_s:g} s to answer and is read every {period_s:g} s: readings are missing",
-    "look at its line: speed, cable, how many units are on it; `stand check` times each device", counts=True)
-DEVICE_FAST = event("device_fast", "info", "{device} answers within {took_s:g} s again")
+    "look at its line: speed, cable, how many units are on it; `stand check` times each device")
+DEVICE_FAST = event("device_fast", "info", "{device} answers within {took_s:g} s again", ends=DEVICE_SLOW)
 DEVICE_IDENTITY = event("device_identity", "info", "{device}: {said}")
 ABSENT = event("absent", "info", "no {what}: {said}")
 BY_HAND_FAILED = event("by_hand_failed", "warning", "{what}: {said}", CONNECTED)
@@ -321,7 +343,7 @@ HOME_RESIDUAL_LARGE = event("home_residual_large", "warning",
 RE_APPROACHED = event("re-approached", "info", "{axis}: {reason}; approached {position:g} {unit} again")
 PICTURES_LOST = event("pictures_lost", "warning", "{device}: {reason}",
     "have it mounted; pictures that come meanwhile are read then")
-PICTURES_BACK = event("pictures_back", "info", "{device}: its folder is there again")
+PICTURES_BACK = event("pictures_back", "info", "{device}: its folder is there again", ends=PICTURES_LOST)
 NO_PICTURE = event("no_picture", "warning", "{device}: no picture for {minutes:g} min",
     "see that the imager takes pictures, and that its folder is the one of the stand's file")
 PICTURE_TAKEN = event("picture_taken", "info", "{device}: {file} of {model} {serial_number}")
@@ -332,9 +354,8 @@ CLOCK_SET_BACK = event("clock_set_back", "warning",
     "nothing to do: its pictures are dated by the new offset; set its clock between two nights")
 
 # The camera.
-CAMERA_LOST = event("camera_lost", "warning", "{said}", CAMERA_ENDS, alert=Alert("device_lost", "camera", "lasting"),
-    counts=True)
-CAMERA_BACK = event("camera_back", "info", "{said}", alert=Alert("device_lost", "camera", "over"))
+CAMERA_LOST = event("camera_lost", "warning", "{said}", CAMERA_ENDS, alert=Alert("device_lost", "camera", "lasting"))
+CAMERA_BACK = event("camera_back", "info", "{said}", alert=Alert("device_lost", "camera", "over"), ends=CAMERA_LOST)
 CAMERA_NOT_OPENED = event("camera_not_opened", "warning", "the camera is powered, and cannot be opened: {said}",
     CONNECTED)
 CAMERA_SUPPLY_OFF = event("camera_supply_off", "error",

@@ -36,6 +36,8 @@ class Hub:
     def publish(self, item: Item) -> None:
         """Remember the readings of a batch, then hand the item on."""
         if isinstance(item, Batch):
+            for event in self._limit.due(item.time_ns) if self._limit is not None else ():
+                self._hand_on(event)
             for reading in item.readings:
                 self._latest[reading.channel] = reading
                 if reading.cause != "wire":
@@ -47,6 +49,9 @@ class Hub:
             if admitted is None:
                 return
             item = admitted
+        self._hand_on(item)
+
+    def _hand_on(self, item: Item) -> None:
         for subscriber in self._subscribers:
             subscriber(item)
 

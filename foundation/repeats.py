@@ -1,12 +1,20 @@
-"""How often a message that repeats is published: what somebody reads at night must not be buried under one sentence."""
+"""How often what repeats is published: what somebody reads at night must not be buried under one sentence.
+
+Three limits, by what the event's row says. A sentence: three at once, then one each 20 min. A state that begins and
+ends, such as a device that is lost and is back: the third time within an hour its end is withheld until it has lasted
+for 20 min, so that the state is told once instead of each time it begins. What begins or ends something that is counted
+or waited for (`counts`) is always published, but beyond six an hour it is an information.
+"""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.foundation.events import always_published
+from thermostand.foundation.events import KINDS, EventKind, must_be_heard, state_of
 from thermostand.foundation.items import Event
 
 FIRST, PERIOD_NS = 3, 1200 * NS_PER_S
@@ -25,17 +33,61 @@ class _Repeated:
     withheld: int = 0
 
 
+@dataclass(slots=True)
+class _State:
+    """Of one device, say: when it began in the last hour, as was published; its end, which is withheld; how often it
+    has begun again since."""
+
+    begun_ns: deque[int] = field(default_factory=deque[int])
+    end: Event | None = None
+    again: int = 0
+
+
 class RepeatLimit:
-    """Warnings and errors with the same kind and sentence, whatever its numbers, but for what is always published."""
+    """Which events are published, and which of them as an information only."""
 
     def __init__(self) -> None:
         self._repeated: dict[tuple[str, str], _Repeated] = {}
+        self._states: dict[tuple[str, str], _State] = {}
 
     def admit(self, event: Event) -> Event | None:
         """The event, with the number of those withheld before it in its data (`repeated`) and its text; None when it is
         withheld."""
-        if event.level == "info" or always_published(event):
+        row = KINDS.get(event.kind)
+        if row is not None and (state := state_of(event)) is not None:
+            return self._of_state(event, row, self._states.setdefault(state, _State()))
+        is_limited = event.level != "info" or (row is not None and row.is_limited)
+        if not is_limited or must_be_heard(event):
             return event
+        admitted = self._of_sentence(event)
+        if row is not None and row.counts:
+            return admitted or replace(event, level="info")
+        return admitted
+
+    def due(self, now_ns: int) -> Iterator[Event]:
+        """The ends of states that were withheld, and have lasted."""
+        for state in self._states.values():
+            if state.end is not None and now_ns - state.end.time_ns >= PERIOD_NS:
+                end, again, state.end, state.again = state.end, state.again, None, 0
+                yield replace(_with_number(end, again), time_ns=now_ns)
+
+    def _of_state(self, event: Event, row: EventKind, state: _State) -> Event | None:
+        while state.begun_ns and event.time_ns - state.begun_ns[0] >= 3 * PERIOD_NS:
+            state.begun_ns.popleft()
+        if row.ends:
+            if len(state.begun_ns) >= FIRST:
+                state.end = event
+                return None
+            again, state.end, state.again = state.again, None, 0
+            return _with_number(event, again)
+        if state.end is not None:  # to those who were told it goes on
+            state.end = None
+            state.again += 1
+            return None
+        state.begun_ns.append(event.time_ns)
+        return event
+
+    def _of_sentence(self, event: Event) -> Event | None:
         now_ns, key = event.time_ns, (event.kind, _NUMBERS.sub("#", event.text))
         found = self._repeated.pop(key, None)
         if found is None or now_ns - found.seen_ns >= 3 * PERIOD_NS:
@@ -51,7 +103,11 @@ class RepeatLimit:
         withheld, found.withheld = found.withheld, 0
         found.published += 1
         found.published_ns = now_ns
-        if not withheld:
-            return event
-        text = f"{event.text} (and {withheld} times more since the last such message)"
-        return replace(event, text=text, data={**event.data, "repeated": withheld})
+        return _with_number(event, withheld)
+
+
+def _with_number(event: Event, withheld: int) -> Event:
+    if not withheld:
+        return event
+    text = f"{event.text} (and {withheld} times more since the last such message)"
+    return replace(event, text=text, data={**event.data, "repeated": withheld})

@@ -17,7 +17,6 @@ from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Cause, Reading, bad_reading
 
 _AGAIN_S = 1.0  # after a poll that failed on the wire
-_FAST_AFTER_NS = 600 * NS_PER_S
 
 
 @dataclass
@@ -27,8 +26,7 @@ class Poller:
     `first()` must succeed before `run()`: what it returns defines which channels to declare BAD when a later read
     fails; a device that has nothing new gives none, and none are published. mark: what is published of the readings of
     a poll at an instant (ns); it may mark some as STALE. A device whose read takes longer than the period is an event,
-    and one more when it was within half a period for ten minutes: a line that is slow now and then is said six times
-    an hour at most.
+    and one more when a read is within half a period again.
     """
 
     sensor: Sensor
@@ -40,7 +38,7 @@ class Poller:
     def __post_init__(self) -> None:
         self._known: tuple[Reading, ...] = ()
         self._failing = False
-        self._lost_ns = self._slow_ns = 0
+        self._lost_ns = 0
         self._is_slow = False
         self._ask_again = False
 
@@ -76,18 +74,13 @@ class Poller:
 
     def _time(self, took_ns: int) -> None:
         """Of one read that succeeded."""
-        took_s, name, now_ns = round(took_ns / NS_PER_S, 3), self.sensor.name, self.clock.now_ns()
-        if took_s > self.period_s / 2:
-            self._slow_ns = now_ns
-        if not self._is_slow and took_s <= self.period_s:
+        is_slow = took_ns > seconds_ns(self.period_s / 2 if self._is_slow else self.period_s)
+        if is_slow == self._is_slow:
             return
-        data: dict[str, object] = {"device": name, "took_s": took_s, "period_s": self.period_s}
-        if not self._is_slow:
-            self._is_slow = True
-            self.hub.publish(DEVICE_SLOW.at(now_ns, **data))
-        elif now_ns - self._slow_ns >= _FAST_AFTER_NS:
-            self._is_slow = False
-            self.hub.publish(DEVICE_FAST.at(now_ns, **data))
+        self._is_slow = is_slow
+        took_s, kind = round(took_ns / NS_PER_S, 3), DEVICE_SLOW if is_slow else DEVICE_FAST
+        now_ns = self.clock.now_ns()
+        self.hub.publish(kind.at(now_ns, device=self.sensor.name, took_s=took_s, period_s=self.period_s))
 
     def _publish(self, readings: tuple[Reading, ...]) -> None:
         if not readings:
