@@ -497,6 +497,9 @@ SOAK_CREDITED = event("soak_credited", "info", "{said}")
 SOAK_LONGER = event("soak_longer", "info", "{said}; the soak goes on, for {by_s:.0f} s at least")
 SOAK_UNSETTLED = event("soak_unsettled", "warning", "{said}; the frames after it are marked as unsettled",
     "a fit leaves its frames out; give the recipe's soak more time, or see what keeps the chamber")
+FRAME_UNSETTLED = event("frame_unsettled", "warning",
+    "the chamber is at {degC:.1f} degC, not within {band_K:g} K of {chamber_degC:g} degC; a frame is marked so",
+    "a fit leaves it out; give the soak before it more time, or see what disturbs the chamber")
 SETTLED = event("settled", "info", "settled after {soaked_s:min} min: {said}")
 NOT_SETTLED = event("not_settled", "warning", "not settled after {soaked_s:min} min: {said}",
     "the plan goes on; `max_s` of the recipe's soak gives it longer")

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
@@ -105,6 +106,26 @@ async def test_after_its_longest_the_frames_are_marked_and_a_fit_leaves_them_out
     assert [event.level for event in events_of(session, "soak_unsettled")] == ["warning"]
     assert [meta.flags for _, meta in session.frame_metas] == [(), (UNSETTLED,)]
     assert observe(path).left_out == {"the chamber was not in its band when the soak before it ended": 1}
+
+
+async def test_a_frame_is_marked_while_the_chamber_is_out_of_its_band(
+    tmp_path: Path, order: Callable[..., Order]
+):
+    """As after a soak too short for the chamber's overshoot; here the regulator reads wrong for a
+    minute."""
+    recipe = (RECIPE % "600").replace("{frames: 1, role: fit}", "{frames: 40, interval_s: 10, role: fit}")
+    ordered = order(recipe, simulation={"faults": ["regulator.pv_offset_K=1.6@750:60"]})
+    session = Session.open(await run_virtual(ordered, tmp_path / "out", None, unwatched))
+    times_ns, pv_degC = session.readings("regulator.pv")
+    marked = list[bool]()
+    for frame_ns, meta in session.frame_metas[1:]:
+        off_K = abs(float(pv_degC[max(0, np.searchsorted(times_ns, frame_ns) - 1)]) - 34.0)
+        if abs(off_K - BAND_K) > 0.25:  # what it moves between a poll and an exposure
+            assert (meta.flags == (UNSETTLED,)) is (off_K > BAND_K)
+            marked.append(off_K > BAND_K)
+    assert 2 <= marked.count(True) <= 30 <= len(marked)
+    assert events_of(session, "soak_unsettled") == []
+    assert 1 <= len(events_of(session, "frame_unsettled")) <= 6
 
 
 async def test_a_run_that_is_interrupted_while_a_soak_goes_on_ends_it_in_the_band_all_the_same(

@@ -26,8 +26,6 @@ LEGS: dict[str, Leg] = {}
 MAX_AIR_DEGC, ABOVE_K = 65.0, 3.0
 FLAP_SHUT_S = 60.0
 BAND_K = 1.0  # of a soak
-# A soak promises its last third, and that of a short one may lie in the overshoot: seed 5201, 120 s and 3.1 K.
-SHORT_S, OVERSHOOT_K = 300.0, 5.0
 EXPOSED_S = 0.5  # a frame's instant is the middle of its exposure, which begins when it is taken
 DURABLE_S = 15.0  # what is younger may be lost by a kill
 LONGEST_GAP_S, PROBED_S = 30.0, 60.0  # between readings; of how long a device is not asked that was lost
@@ -313,17 +311,12 @@ def frames_are_at_their_temperature(evidence: Evidence) -> Iterator[str]:
     """The air is within the soaks' band and what its sensor may be off, or the frame says `unsettled`. Each capture
     of a case has a soak before it, which somebody may have left out."""
     wanted = {mark.step_id: mark.parameters.get("chamber_degC") for mark in evidence.marks if mark.kind == "capture"}
-    soaks = sorted(
-        (mark.time_ns, mark.parameters.get("duration_s", SHORT_S)) for mark in evidence.marks if "soak" in mark.kind
-    )
     for time_ns, step_id, flags in evidence.metas:
-        before = soaks[max(0, bisect.bisect_right(soaks, (time_ns, math.inf)) - 1)] if soaks else (0, SHORT_S)
-        overshoot_K = OVERSHOOT_K if before[1] < SHORT_S else 0.0
         at_s, degC, row = evidence.at_s(time_ns), wanted.get(step_id), evidence.true_at(time_ns)
         is_odd = evidence.excused(at_s, "thermometer", "regulator", "chamber", after_s=600.0)
         if degC is None or row is None or is_odd or "unsettled" in flags:
             continue
-        if abs(float(row["bulk_air_degC"]) - degC) > BAND_K + _SENSOR_K + overshoot_K:
+        if abs(float(row["bulk_air_degC"]) - degC) > BAND_K + _SENSOR_K:
             yield f"a frame at {at_s} s for {degC:g} degC was taken at {row['bulk_air_degC']:.2f} degC"
 
 
@@ -338,7 +331,8 @@ def readings_are_true(evidence: Evidence) -> Iterator[str]:
         for time_ns, value, quality in rows if name in _TRUE else ():
             at_s, row = evidence.at_s(time_ns), evidence.true_at(time_ns)
             is_odd = evidence.excused(at_s, "thermometer", "regulator.probe_exchanged", after_s=30.0)
-            is_odd = is_odd or evidence.excused(at_s, "thermometer.drift_K_per_h", after_s=math.inf)  # it stays so far off
+            # What has drifted stays so far off.
+            is_odd = is_odd or evidence.excused(at_s, "thermometer.drift_K_per_h", after_s=math.inf)
             if row is None or is_odd or not quality.endswith("GOOD"):
                 continue
             if abs(value - (true := float(row[_TRUE[name]]))) > _SENSOR_K:

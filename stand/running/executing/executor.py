@@ -25,7 +25,6 @@ from thermostand.foundation.errors import ConfigError, DeviceError, Superseded
 from thermostand.foundation.events import PLAN_CHANGED, STEP_BROKEN_OFF, UNDECIDED, WARM_UP_GAP
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import StepMark, StepState
-from thermostand.foundation.readings import UNSETTLED
 from thermostand.foundation.tasks import cancelled, first_of
 from thermostand.recording.format.restarts import restarted
 from thermostand.stand.interlock import Interlocked
@@ -304,7 +303,7 @@ class Executor:
             # A camera continues to warm up while the run is held: what was not seen of it is reported.
             missing_s = (self._clock.now_ns() - self._state.seen_ns) / NS_PER_S
             self._log.tell(WARM_UP_GAP, missing_s=missing_s)
-        flags = (UNSETTLED,) if self._state.is_unsettled and capture.role is not Role.WARM_UP else ()
+        flags = () if capture.role is Role.WARM_UP else self._soaking.flags()
         imaging = self._stand.imaging
         is_taken = await imaging.take_frame(capture.exposure_s, step_id, frame.due_ns, capture.cameras, flags)
         now_ns = self._clock.now_ns()

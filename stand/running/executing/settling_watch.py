@@ -78,6 +78,14 @@ class SettlingWatch:
         since = 0 if not ends.size else int(ends[-1]) + 1
         return 0.0 if since == time_s.size else now_s - float(time_s[since])
 
+    def outside_degC(self, chamber_degC: float, band_K: float) -> float | None:
+        """Where the chamber is when that is outside the band around its set-point; None when it is inside, or is not
+        known (a frame then has no temperature of it either)."""
+        chamber = self._readings[CHAMBER]
+        if not chamber or seconds(self._clock.now_ns()) - chamber[-2] > _UNKNOWN_S:
+            return None
+        return chamber[-1] if abs(chamber[-1] - chamber_degC) > band_K else None
+
     async def is_settled(self, soak: SoakUntilSettled, step_id: str, soaked_s: float) -> bool:
         """Whether the soak, `soaked_s` old, may end now; says so, and also when it has to end without.
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from thermostand.experiments.steps import AnySoak, PlannedStep, Soak
 from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import DeviceFault
-from thermostand.foundation.events import SOAK_LONGER, SOAK_UNSETTLED
+from thermostand.foundation.events import FRAME_UNSETTLED, SOAK_LONGER, SOAK_UNSETTLED
+from thermostand.foundation.readings import UNSETTLED
 from thermostand.foundation.tasks import first_of
 from thermostand.stand.gate import Gate
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
@@ -51,6 +52,20 @@ class Soaking:
             earned_ns = min(earned_ns + now_ns - begin_ns, whole_ns)
             if step_id not in self._state.skipped:
                 await self._keep(soak, now_ns, earned_ns, is_over=has_ended or earned_ns == whole_ns)
+
+    def flags(self) -> tuple[str, ...]:
+        """Of a frame that is taken now: whether the last soak has not brought the chamber into its band, or the chamber
+        has left it since, as one that overshoots does after a soak that was too short."""
+        chamber_degC, band_K = self._state.set_up.chamber_degC, self._state.band_K
+        if self._state.is_unsettled:
+            return (UNSETTLED,)
+        if chamber_degC is None or band_K is None:
+            return ()
+        degC = self._settling.outside_degC(chamber_degC, band_K)
+        if degC is None:
+            return ()
+        self._log.tell(FRAME_UNSETTLED, degC=degC, chamber_degC=chamber_degC, band_K=band_K)
+        return (UNSETTLED,)
 
     async def _keep(self, soak: PlannedStep, now_ns: int, earned_ns: int, *, is_over: bool) -> None:
         """What it has earned; and when it is over, whether the chamber was in its band at last."""

@@ -6,7 +6,7 @@ It is folded from the run's entries (fold.py); what to do next is read from it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -162,15 +162,24 @@ class RunState:
     def is_unsettled(self) -> bool:
         """Whether the last guaranteed soak at the present set-point ended without the chamber in its band, or all of
         them were left out."""
-        is_left_out = False
+        soaks = list(self._soaks_here())
+        done = (each.step_id for each, _ in soaks if each.step_id not in self.skipped)
+        return bool(soaks) and self.soaked.get(next(done, ""), "unsettled") == "unsettled"
+
+    @property
+    def band_K(self) -> float | None:
+        """Of the last guaranteed soak at the present set-point that was not left out; None when there is none."""
+        return next((band_K for each, band_K in self._soaks_here() if each.step_id not in self.skipped), None)
+
+    def _soaks_here(self) -> Iterator[tuple[PlannedStep, float]]:
+        """The guaranteed soaks at the present set-point with their bands, K; the last one first."""
         for planned in reversed(self.plan[: self.index]):
-            if planned.step_id in self.skipped:
-                is_left_out = is_left_out or _is_guaranteed(planned)
-            elif _is_guaranteed(planned):
-                return self.soaked.get(planned.step_id) == "unsettled"
-            elif isinstance(planned.step, StartChamber | SetTemperature | StopChamber):
-                break
-        return is_left_out
+            if isinstance(planned.step, AnySoak) and planned.step.guaranteed_K > 0.0:
+                yield planned, planned.step.guaranteed_K
+            elif isinstance(planned.step, StartChamber | SetTemperature | StopChamber) and (
+                planned.step_id not in self.skipped
+            ):
+                return
 
     def step(self, step_id: str) -> PlannedStep | None:
         """The step of that id in the plan in force."""
@@ -194,7 +203,3 @@ class RunState:
 def duration_of(soak: PlannedStep) -> int:
     """What the soak takes at the most, ns; 0 when it is no soak."""
     return seconds_ns(soak.step.longest_s) if isinstance(soak.step, AnySoak) else 0
-
-
-def _is_guaranteed(soak: PlannedStep) -> bool:
-    return isinstance(soak.step, AnySoak) and soak.step.guaranteed_K > 0.0
