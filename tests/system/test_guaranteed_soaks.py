@@ -108,9 +108,7 @@ async def test_after_its_longest_the_frames_are_marked_and_a_fit_leaves_them_out
     assert observe(path).left_out == {"the chamber was not in its band when the soak before it ended": 1}
 
 
-async def test_a_frame_is_marked_while_the_chamber_is_out_of_its_band(
-    tmp_path: Path, order: Callable[..., Order]
-):
+async def test_a_frame_is_marked_while_the_chamber_is_out_of_its_band(tmp_path: Path, order: Callable[..., Order]):
     """As after a soak too short for the chamber's overshoot; here the regulator reads wrong for a
     minute."""
     recipe = (RECIPE % "600").replace("{frames: 1, role: fit}", "{frames: 40, interval_s: 10, role: fit}")
