@@ -45,7 +45,7 @@ _LOADED = {
     ),
     "tests.torture.product": ("thermostand.stand.commands.run_cli", *_INTERFACE),
     "tests.code": (
-        "thermostand.stand.running.run",
+        "thermostand.stand.run",
         "thermostand.stand.queueing.queue_work",
         "thermostand.stand.serving.api.server",
         *_INTERFACE,

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 from thermostand.foundation.usage import Lazy, lazy_app
 
+_VERBS = "thermostand.stand.commands.verbs"
 _PLAN, _RUN, _CONTROL = (
     "thermostand.stand.commands.plan_cli",
     "thermostand.stand.commands.run_cli",
     "thermostand.stand.commands.control_cli",
 )
+
+
+def _verbs() -> dict[str, Lazy]:
+    """The commands of the stand's service that have a verb, from its source: to import it takes longer than the list
+    may."""
+    found: dict[str, Lazy] = {}
+    tree = ast.parse((Path(__file__).parents[1] / "service.py").read_bytes())
+    for method in (each for each in ast.walk(tree) if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)):
+        for mark in (each for each in method.decorator_list if isinstance(each, ast.Call)):
+            settings = {each.arg: ast.unparse(each.value) for each in mark.keywords}
+            if ast.unparse(mark.func) == "command" and settings.get("has_verb") != "False":
+                text = " ".join((ast.get_docstring(method) or "").split())
+                found[method.name.rstrip("_")] = Lazy(_VERBS, text.partition(". ")[0].rstrip(".") + ".")
+    return found
 
 
 app = lazy_app(
@@ -28,12 +46,8 @@ app = lazy_app(
         "foxglove": Lazy(
             "thermostand.stand.commands.foxglove_cli", "Show a running stand live in Foxglove or Lichtblick."
         ),
-        "pause": Lazy(_CONTROL, "Hold the run before its next action."),
-        "continue": Lazy(_CONTROL, "End a pause."),
+        **_verbs(),
         "clear": Lazy(_CONTROL, "Continue a run that an interlock holds, once you have removed the cause."),
-        "skip": Lazy(_CONTROL, "Leave a step out."),
-        "extend": Lazy(_CONTROL, "Soak for longer in a step."),
-        "stop": Lazy(_CONTROL, "Make the stand safe and end the run, as Ctrl-C does."),
         "check": Lazy(
             "thermostand.stand.commands.check_cli",
             "Check each device of a stand: connected, the right unit, its settings, a reading.",

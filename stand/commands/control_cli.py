@@ -1,7 +1,4 @@
-"""The commands for a run that is under way: status, watch, pause, continue, skip, extend, stop, clear.
-
-They are thin clients of the HTTP interface: whatever they do, a program can do as well.
-"""
+"""The commands that look at a run under way, and `clear`, which a stand without a daemon has, too."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ import typer
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.command_app import App
-from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.errors import SessionError
 from thermostand.foundation.instants import duration, local_text
 from thermostand.foundation.output import output, show
 from thermostand.foundation.usage import one_line
@@ -29,7 +26,8 @@ from thermostand.stand.commands.reached import (
     reached,
 )
 from thermostand.stand.commands.sessions.session_text import size
-from thermostand.stand.gate import ENDINGS, HELD, INTERLOCK, OPERATOR, STOPPING
+from thermostand.stand.gate import ENDINGS, HELD, INTERLOCK, STOPPING
+from thermostand.stand.service import held_text
 from thermostand.stand.serving.client import API, Answer, Server
 from thermostand.stand.serving.desk import FaultState, RunStatus, StandState
 from thermostand.stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
@@ -37,7 +35,6 @@ from thermostand.stand.watching.remedies import next_command
 
 app = App()
 
-StepArgument = Annotated[str, typer.Argument(metavar="STEP", help="Its number in `stand status --plan`, or its id.")]
 _WATCH_S = 2.0
 _AGAIN_S, _LOOK_S = 2.0, 0.25  # the guard looks once a second
 _LABEL = 14
@@ -89,39 +86,6 @@ def watch(server: Server) -> None:
 
 
 @app.command()
-@on_stand()
-def pause(
-    server: Server,
-    at_next_step: Annotated[
-        bool, typer.Option("--at-next-step", help="When the step under way is done, not before the next action.")
-    ] = False,
-) -> None:
-    """Hold the run before its next action; the chamber keeps its set-point, a dwell what it has earned.
-
-    Moves under way are completed, and the answer lists them; `stand stop` stops it. The flap is shut within a
-    minute. After guard.pause_limit_h the stand is made safe and held.
-
-    Example: stand pause && stand continue
-    """
-    answer = server.order("pause", {"when": "step" if at_next_step else "now"})
-    names = ", ".join(map(one_line, cast("list[str]", answer.get("moving", []))))
-    moving = f"still moving: {names}" if names else "nothing moves"
-    when = "pauses when the step under way is done" if at_next_step else "paused"
-    _say(server, answer, f"{when}; `stand continue` ends the pause; {moving}")
-
-
-@app.command("continue")
-@on_stand()
-def continue_(server: Server) -> None:
-    """End a pause.
-
-    Example: stand continue sessions/20260101T180000Z-thermal-cycle
-    """
-    answer = server.order("continue")
-    _say(server, answer, _still(answer))
-
-
-@app.command()
 def clear(
     directory: DirectoryArgument = None,
     config: ConfigOption = "simulated",
@@ -146,49 +110,12 @@ def clear(
         text = f"cleared; held again: {again.rule}: {again.text}"
         _say(server, {**answer, "text": text, "reasons": [INTERLOCK]}, f"{text}; {ENDINGS[INTERLOCK]}")
     else:
-        held = _still(answer) if answer.get("reasons") else "nothing holds the stand any more"
+        held = (
+            held_text(cast("list[str]", answer["reasons"]))
+            if answer.get("reasons")
+            else "nothing holds the stand any more"
+        )
         _say(server, answer, f"{text}; {held}")
-
-
-@app.command()
-@on_stand()
-def skip(
-    server: Server,
-    step: StepArgument,
-) -> None:
-    """Leave a step out; a soak, capture, cool-down or prompt under way is broken off. Frames after a soak that was left
-    out are flagged `unsettled`, and a fit leaves them out.
-
-    Example: stand skip 12
-    """
-    answer = server.order("skip", {"step_id": _step_id(server, step)})
-    _say(server, answer, f"step {step} is left out")
-
-
-@app.command()
-@on_stand()
-def extend(
-    server: Server,
-    step: StepArgument,
-    minutes: Annotated[float, typer.Argument(help="How much longer, in minutes.")],
-) -> None:
-    """Soak for longer in a step.
-
-    Example: stand extend 12 30
-    """
-    answer = server.order("extend", {"step_id": _step_id(server, step), "by_s": 60.0 * minutes})
-    _say(server, answer, f"step {step} takes {minutes:g} min longer")
-
-
-@app.command()
-@on_stand(anywhere=True)
-def stop(server: Server) -> None:
-    """Make the stand safe and end the run, as Ctrl-C does.
-
-    Example: stand stop
-    """
-    answer = server.order("stop")
-    _say(server, answer, str(answer["text"]))
 
 
 def _held_again(server: Server) -> FaultState | None:
@@ -248,16 +175,6 @@ def _show_plan(server: Server) -> None:
     steps = cast("list[Answer]", server.request("GET", f"{API}/plan"))
     lines = [f"{_number(step):>5}  {str(step['standing']).replace('_', ' '):<10}  {step['text']}" for step in steps]
     show(steps, map(one_line, lines))
-
-
-def _step_id(server: Server, step: str) -> str:
-    """The id of a step that is given by its number in the plan."""
-    if not step.isdecimal():
-        return step
-    for planned in cast("list[Answer]", server.request("GET", f"{API}/plan")):
-        if _number(planned) == int(step):
-            return str(planned["step_id"])
-    raise ConfigError(f"the plan has no step {step}; `stand status --plan` shows those there are")
 
 
 def _number(planned: Answer) -> int:
@@ -324,12 +241,3 @@ def _warning(found: RunStatus) -> str:
         return found.warning or "none"
     level = "error, " if found.warning_level == "error" else ""
     return f"{level}{local_text(found.warning_ns + found.warning_utc_offset_ns)}: {found.warning}"
-
-
-def _still(answer: Mapping[str, object]) -> str:
-    """Whether the run continues, and if not, what may be done about it."""
-    reasons = cast("list[str]", answer.get("reasons", []))
-    if not reasons:
-        return "the run continues"
-    known = [ENDINGS[reason] for reason in reasons if reason in (OPERATOR, INTERLOCK)]
-    return "; ".join([f"still held: {', '.join(reasons)}", *known])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,18 +11,24 @@ import typer
 
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.command_app import App
-from thermostand.foundation.errors import Interrupted
+from thermostand.foundation.errors import ConfigError, Interrupted, SessionError, StandError, StandTripped
 from thermostand.foundation.exit_codes import INTERRUPTED
+from thermostand.foundation.hub import Hub
 from thermostand.foundation.instants import date_time, duration
 from thermostand.foundation.output import say, show
 from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.queue_door import DaemonDoor, Door, OutOption, at_door, directory_of
 from thermostand.stand.commands.reached import ConfigOption, RecipeArgument
+from thermostand.stand.estimating.learned import learn
+from thermostand.stand.estimating.run_estimate import price_night
 from thermostand.stand.queueing import queue
 from thermostand.stand.queueing.queue_file import Entry
-from thermostand.stand.queueing.queue_run import conclude, run_entry
-from thermostand.stand.queueing.queue_work import Notes, work
+from thermostand.stand.queueing.queue_work import Halt, Notes, Watch, interruption_of, is_complete, work
+from thermostand.stand.run import resume, run_real, run_virtual
+from thermostand.stand.running.resume import is_of_virtual_time
+from thermostand.stand.running.session_report import NotReported, check_reportable, report_session
 from thermostand.stand.serving.desk import QueuedRun
+from thermostand.stand.watching.live import followed
 
 app = App(
     no_args_is_help=True,
@@ -158,3 +164,58 @@ def _cells(entry: Entry | QueuedRun, turn: int | None) -> tuple[str, ...]:
         one_line(entry.session),
         one_line(entry.reason),
     )
+
+
+async def run_entry(directory: Path, entry: Entry, notes: Notes, *, virtual_time: bool) -> Path:
+    """Run `entry` into a session below `directory`, or resume the one it has; it is shown while it runs.
+
+    Returns the session's folder. Halt when an interrupted run cannot be resumed, or one that failed has left the stand
+    not confirmed safe; else raises as a run does.
+    """
+    session = directory / entry.session if entry.session else None
+    if session is not None and await asyncio.to_thread(is_complete, session):
+        return session  # killed between its end and the note of it
+    order = queue.order_of(entry)
+    before = None if session is None else await asyncio.to_thread(interruption_of, session, order.config)
+    night = price_night(tuple(order.recipe.plan()) if before is None else before.state.plan, order.config, directory)
+    watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
+    try:
+        is_virtual = virtual_time or is_of_virtual_time(before)
+        with followed(order, night, directory, is_virtual=is_virtual, before=before) as show:
+
+            def subscribe(hub: Hub) -> None:
+                show(hub)
+                hub.subscribe(watch)
+
+            if before is not None:
+                return await resume(before, subscribe)
+            if virtual_time:
+                return await run_virtual(order, directory, None, subscribe, notes.begun)
+            return await run_real(order, directory, subscribe, notes.begun)
+    except (Interrupted, StandTripped):
+        raise
+    except StandError as error:
+        if watch.unsafe:
+            raise Halt(f"{error}; NOT SAFE: {'; '.join(watch.unsafe)}") from error
+        raise
+
+
+def conclude(entry: Entry, session: Path, tell: Callable[[str], None], *, report: bool) -> None:
+    """What follows a complete run, which none of it makes fail: what it teaches about durations is kept for the next,
+    and with `report` the drift is fitted and reported in the session's folder, when the recipe has any. Takes a minute.
+    """
+    order = queue.order_of(entry)
+    try:
+        learn(session.parent, order.config)
+    except (SessionError, OSError) as error:
+        tell(f"warning: {error}")
+    if not report:
+        return
+    try:
+        check_reportable(order.recipe.plan())
+        for line in report_session(session, session).lines:
+            tell(line)
+    except (ConfigError, NotReported) as error:
+        tell(f"{session.name}: {error}")
+    except Exception as error:  # noqa: BLE001 - a fit that fails must not end the queue
+        tell(f"{session.name}: is recorded, but not reported: {type(error).__name__}: {error}")

@@ -25,9 +25,9 @@ from thermostand.stand.config.checked import load_checked
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.estimating.learned import learn
 from thermostand.stand.estimating.run_estimate import existing, price_night, small_disk
+from thermostand.stand.run import resume, run_real, run_virtual
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.resume import interruption, is_of_virtual_time
-from thermostand.stand.running.run import resume, run_real, run_virtual
 from thermostand.stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
 from thermostand.stand.serving.client import Server, server_at
 from thermostand.stand.serving.desk import QueuedRun

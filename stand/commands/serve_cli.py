@@ -26,9 +26,9 @@ from thermostand.stand.commands.reloading import Reloading
 from thermostand.stand.config.checked import ATTACHMENT, load_checked
 from thermostand.stand.config.interface_section import load_tokens
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.daemon.daemon_desk import DaemonDesk
 from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.order import optics_texts
+from thermostand.stand.service import StandService
 from thermostand.stand.serving.api.bridge import Bridge
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve as serve_clients
@@ -80,10 +80,10 @@ def serve(
     try_doors(interface)
 
     @asynccontextmanager
-    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+    async def front(service: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
         viewing = Viewing(hub, clock, directory, texts["target.yaml"])
         served = replace(interface, rooms=(_page(viewing),))
-        async with serve_clients(desk, hub, clock, directory, stand.name, served, desk.patience):
+        async with serve_clients(service, directory, stand.name, served, service.patience):
             where = f"; http://{host}:{port}/" if port is not None else ""
             where += f"; SECoP at {secop_port}" if secop_port is not None else ""
             event = OPEN.at(clock.now_ns(), where, stand=stand.name, sessions=str(directory), port=port)

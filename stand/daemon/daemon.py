@@ -9,12 +9,15 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, suppress
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
 from pydantic import JsonValue
 
 from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.experiments.steps import Capture
 from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
 from thermostand.foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
 from thermostand.foundation.events import (
@@ -36,25 +39,32 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.tasks import cancelled, failure_text, watched
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S
+from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.daemon import systemd
 from thermostand.stand.daemon.by_hand import ByHand
 from thermostand.stand.daemon.counters import Counters
 from thermostand.stand.daemon.daemon_file import Kept, KeptFile
 from thermostand.stand.daemon.day_record import DayRecord
-from thermostand.stand.daemon.orders import Orders
+from thermostand.stand.estimating.learned import learn
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.queueing.orders import Orders, said_of
 from thermostand.stand.queueing.queue_file import Entry
-from thermostand.stand.queueing.queue_work import Notes, drain
-from thermostand.stand.running.guest import Guest
+from thermostand.stand.queueing.queue_work import Halt, Notes, Stopped, Watch, drain, interruption_of, is_complete
+from thermostand.stand.run import run_in
+from thermostand.stand.running.executing.settling_watch import load_for
+from thermostand.stand.running.guest import Guest, Job
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stand_latch import LatchedFault
-from thermostand.stand.running.opening.stop import STOPPED, catch_signals
+from thermostand.stand.running.opening.stop import STOPPED, Stop, catch_signals
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
-from thermostand.stand.serving.desk import Conflict
+from thermostand.stand.running.resume import Interruption, repaired
+from thermostand.stand.running.said import keep
+from thermostand.stand.service import StandService
+from thermostand.stand.serving.desk import Conflict, DeviceState, HeatByHand, Who
 
-# What answers the clients of a daemon while inside.
-Answering = Callable[[Hub, WallClock], AbstractAsyncContextManager[object]]
+# What answers the clients of a stand while inside.
+Front = Callable[[StandService, Hub, WallClock], AbstractAsyncContextManager[object]]
 
 _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
 _ENDS = Fault(STOPPED.rule, "the daemon was ended")
@@ -75,6 +85,7 @@ class Daemon:
         kept: Kept,
         keep: KeptFile,
         latched: LatchedFault | None = None,
+        recorded: Callable[[Path], None] | None = None,
     ) -> None:
         assembly = open_stand.assembly
         self.open_stand = open_stand
@@ -83,6 +94,7 @@ class Daemon:
         config, hub = assembly.config, assembly.hub
         self.counters = Counters(kept.counters, config.axes, config.chamber.heater_W, hub)
         self.by_hand = ByHand(assembly, self._check_heat)
+        self.service = StandService(open_stand, self)
         self.has_guest = False  # from the moment it is let in until it has gone
         self._is_draining = False  # until the queue knows how its run has ended
         self._assembly = assembly
@@ -90,6 +102,7 @@ class Daemon:
         self._clock = assembly.clock
         self._keep = keep
         self._latched = latched  # by a program before this one
+        self._recorded_whole = recorded  # is told of complete runs with frames
         self._status = systemd.Status()
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
         self._is_given_up = False  # an operator does not want to wait for the confirmation that the stand is safe
@@ -105,10 +118,24 @@ class Daemon:
         """The run that has the stand."""
         return cast("Guest | None", self.open_stand.guest)
 
-    @property
-    def disk_free_bytes(self) -> int:
-        """Where it is recorded; 0 when that is not known."""
-        return 0 if self.record.recorder is None else self.record.recorder.disk_free_bytes
+    def seen(self) -> dict[str, object]:
+        """The fields of the state that are a daemon's; disk_free_bytes is 0 when it is not known."""
+        recorder, ordered = self.record.recorder, self._assembly.stand.chamber.ordered
+        by_hand = None
+        if ordered is not None and not self.has_guest:  # as it was ordered: the regulator may not answer
+            by_hand = HeatByHand(**asdict(ordered), cut_ns=self._assembly.stand.chamber.permits.ended_ns)
+        return {
+            "queue": self.orders.shown(),
+            "queue_halted": self.orders.queued.halted,
+            "counters": {name: round(value, 4) for name, value in self.counters.values.items()},
+            "busy": self.busy,
+            "disk_free_bytes": 0 if recorder is None else recorder.disk_free_bytes,
+            "by_hand": by_hand,
+        }
+
+    def devices(self) -> tuple[DeviceState, ...]:
+        """What is there, and what it takes by hand now."""
+        return self.by_hand.devices(self.refused_by_hand())
 
     def wake(self) -> None:
         """There may be something to be run."""
@@ -178,7 +205,7 @@ class Daemon:
             raise error
         return f"{what}: done"
 
-    async def serve(self, answering: Answering) -> None:
+    async def serve(self, front: Front) -> None:
         """Until `leave`; then the stand is safe. Raises what makes that impossible."""
         async with AsyncExitStack() as stack:
             stack.push_async_callback(cancelled, self._extending)
@@ -195,13 +222,13 @@ class Daemon:
                 self.open_stand.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
             self.open_stand.guard.look()
             catch_signals(self.leave)
-            await watched(self._serve(answering), self.open_stand.tasks)
+            await watched(self._serve(front), self.open_stand.tasks)
 
-    async def _serve(self, answering: Answering) -> None:
+    async def _serve(self, front: Front) -> None:
         worker = asyncio.create_task(self._work())
         tasks = [worker, asyncio.create_task(self._look_after()), asyncio.create_task(self._feed())]
         try:
-            async with answering(self._hub, cast("WallClock", self._clock)):
+            async with front(self.service, self._hub, cast("WallClock", self._clock)):
                 systemd.tell(systemd.READY, "STATUS=idle")
                 try:
                     await watched(self._left(), tasks)
@@ -298,7 +325,7 @@ class Daemon:
             await self.orders.read()
             if self._assembly.stand.chamber.permits.granted:
                 await self._assembly.stand.chamber.stop()
-            return await self.orders.run_one(entry, notes, begun, self._say)
+            return await self._perform(entry, notes, begun)
         except StandError as error:
             if not has_begun and not isinstance(error, Interrupted):
                 self._tell(RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
@@ -310,6 +337,63 @@ class Daemon:
             self.has_guest = False
             self.note()
             self._status.tell(self.by_hand.doing)
+
+    async def _perform(self, entry: Entry, notes: Notes, begun: Callable[[], None]) -> Path:
+        """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
+        without the record between runs. Raises as a run does, Stopped when an operator has stopped it: who presses
+        stop does not want the next one to begin."""
+        orders, hub, clock = self.orders, self._hub, self._clock
+        session = orders.directory / entry.session if entry.session else None
+        if session is not None and await orders.repair.call(is_complete, session):
+            return session  # killed between its end and the note of it
+        order = await orders.reading.call(orders.order_of, entry)
+        before = None if session is None else await self._interruption(session, order.config)
+        watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
+
+        async def recorded(folder: Path) -> None:
+            await notes.begun(folder)
+            begun()
+            if session is None and (said := said_of(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
+                try:
+                    await keep(said, folder, orders.notes, hub, clock)
+                except SessionError as error:
+                    self._say(f"warning: {error}")
+
+        def follow(hub: Hub) -> None:
+            hub.subscribe(watch)
+
+        plan = tuple(order.recipe.plan())
+        await asyncio.to_thread(load_for, plan)
+        job = Job(order, orders.directory, None, follow, recorded, before)
+        try:
+            async with Stop(has_signals=False) as orders.stop:
+                done = await run_in(self.open_stand, job, orders.stop)
+        except Interrupted as error:
+            if orders.leaving:
+                raise
+            follows = any(each.is_open for each in orders.queued.entries)
+            clear = "; the next of the queue begins when the stand is cleared" if follows else ""
+            raise Stopped(f"{error}; it may be resumed{clear}", halts=follows) from error
+        finally:
+            orders.stop = None
+            hub.unsubscribe(watch)
+        try:
+            await orders.repair.call(learn, orders.directory, order.config)
+        except SessionError as error:
+            self._say(f"warning: what this run has taught of durations is not kept: {error}")
+        if self._recorded_whole is not None and any(isinstance(planned.step, Capture) for planned in plan):
+            self._recorded_whole(done)
+        return done
+
+    async def _interruption(self, session: Path, config: StandConfig) -> Interruption:
+        """What is left of its run; Halt when it cannot be resumed. What has to be written for that is written by the
+        disk's process."""
+        try:
+            salvaged = await self.orders.repair.call(repaired, session)
+        except SessionError as error:
+            raise Halt(str(error)) from error
+        before = await self.orders.reading.call(partial(interruption_of, session, config, clear=True))
+        return replace(before, salvaged=(*salvaged, *before.salvaged))
 
     async def _record_day(self) -> None:
         """Heat depends on the record between runs while no run records; a disk that refuses it is an event, and

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager, AsyncExitStack
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 from thermostand.foundation.clock import WallClock
@@ -19,21 +18,17 @@ from thermostand.stand.assembly import assemble
 from thermostand.stand.config.checked import ATTACHMENT
 from thermostand.stand.config.safe_ranges import accepted_text
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.daemon_desk import DaemonDesk
+from thermostand.stand.daemon.daemon import Daemon, Front
 from thermostand.stand.daemon.daemon_file import KeptFile, kept_in
 from thermostand.stand.daemon.day_record import DayRecord
-from thermostand.stand.daemon.orders import Orders
 from thermostand.stand.daemon.reports import Reports
+from thermostand.stand.queueing.orders import Orders
 from thermostand.stand.running.opening.claim import claimed
 from thermostand.stand.running.opening.clock_watch import ClockWatch
 from thermostand.stand.running.opening.open_stand import opened
 from thermostand.stand.running.opening.stand_latch import StandLatch
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.serving.alerts import alerting
-
-# What answers the clients of the stand's desk while inside.
-Front = Callable[[DaemonDesk, Hub, WallClock], AbstractAsyncContextManager[object]]
 
 
 async def serve(
@@ -70,17 +65,23 @@ async def serve(
                 keep = KeptFile(out, open_stand.disk.line(FILES_LINE).run, hub, clock)
                 reports = Reports(hub, clock)
                 stack.push_async_callback(reports.close)
-                orders = Orders(
-                    open_stand, open_stand.disk, out, config_name, texts, reports.add if has_reports else None
-                )
+                orders = Orders(open_stand, open_stand.disk, out, config_name, texts)
                 for segment in await orders.repair.call(salvage_unfinished, out):
                     hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
                 if accepted := config.accepted():
                     hub.publish(LIMITS_ACCEPTED.at(clock.now_ns(), accepted_text(accepted), **accepted))
                 if damage:
                     hub.publish(DAEMON_FILE_DAMAGED.at(clock.now_ns(), damage))
-                daemon = Daemon(open_stand, orders, record, kept, keep, latched)
-                await daemon.serve(lambda hub, clock: front(DaemonDesk(daemon), hub, clock))
+                daemon = Daemon(
+                    open_stand,
+                    orders,
+                    record,
+                    kept,
+                    keep,
+                    latched=latched,
+                    recorded=reports.add if has_reports else None,
+                )
+                await daemon.serve(front)
             if unsafe := assembly.stand.safety.unconfirmed:
                 raise StandTripped(f"the daemon ends, but NOT SAFE: {'; '.join(unsafe)}")
         finally:

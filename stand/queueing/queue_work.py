@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from thermostand.foundation.clock import Now, WallClock
-from thermostand.foundation.errors import DeviceError, Interrupted, InUse, SessionError, StandError, StandTripped
+from thermostand.foundation.errors import (
+    ConfigError,
+    DeviceError,
+    Interrupted,
+    InUse,
+    SessionError,
+    StandError,
+    StandTripped,
+)
+from thermostand.foundation.events import NOT_CONFIRMED_SAFE
+from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.patience import Patience
 from thermostand.recording.writing.disk import QUEUE_LINE, Disk, DiskCalls
+from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.queueing.queue import finish, note_session, note_step, queued, take
 from thermostand.stand.queueing.queue_file import Entry, State, working
+from thermostand.stand.running.memory.entries import Ended
+from thermostand.stand.running.memory.journal import Journal
+from thermostand.stand.running.resume import Interruption, interruption
 
 MOST_FRUITLESS_STARTS = 3
 _NOTED_WITHIN_S = 1.0  # real seconds that a disk may take for the note of a run's end; it is written later, then
@@ -175,3 +189,38 @@ class _Run:
     async def _noted_last(self, change: Callable[[], None]) -> None:
         await self._noted()
         await self._disk.call(change)
+
+
+class Watch:
+    """Reports steps that were not done before, and keeps which actuators have not confirmed their safe state."""
+
+    def __init__(self, done: Collection[str], step_done: Callable[[], None]) -> None:
+        self.unsafe: list[str] = []
+        self._done = done
+        self._step_done = step_done
+
+    def __call__(self, item: Item) -> None:
+        """Follow one item."""
+        if isinstance(item, Event) and item.kind == NOT_CONFIRMED_SAFE:
+            self.unsafe.append(item.text)
+        if isinstance(item, StepMark) and item.state is StepState.DONE and item.step_id not in self._done:
+            self._step_done()
+
+
+def interruption_of(session: Path, own: StandConfig, *, clear: bool = False) -> Interruption:
+    """What is left of the run of a session, for this stand; Halt when it cannot be resumed."""
+    try:
+        return interruption(session, own, clear=clear)
+    except (SessionError, ConfigError) as error:
+        raise Halt(str(error)) from error
+
+
+def is_complete(session: Path) -> bool:
+    """Whether the run recorded in `session` came to its end; Halt when its journal does not say."""
+    try:
+        journal, entries = Journal.open(session)
+    except SessionError as error:
+        raise Halt(str(error)) from error
+    journal.release()
+    last = entries[-1] if entries else None
+    return isinstance(last, Ended) and last.status == "complete"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -13,13 +13,12 @@ from pathlib import Path
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import VirtualClock, boot_of, utc_offset_ns
 from thermostand.foundation.documents import parse_document
-from thermostand.foundation.errors import NotCleared, StandError, StandTripped
+from thermostand.foundation.errors import NotCleared, StandTripped
 from thermostand.foundation.events import (
     CLEARED,
     FRAMES_RESUMED,
     FRAMES_STOPPED,
     GAP,
-    NO_CONTROL,
     RUN_END,
     RUN_RESUME,
     RUN_START,
@@ -38,6 +37,7 @@ from thermostand.stand.assembly import Assembly
 from thermostand.stand.estimating.run_estimate import price_night
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
+from thermostand.stand.running.course import Course
 from thermostand.stand.running.executing.camera_gap import OffsetGap, OffsetWatch, doubt
 from thermostand.stand.running.executing.deciding import Decider
 from thermostand.stand.running.executing.executor import Executor
@@ -51,11 +51,9 @@ from thermostand.stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
 from thermostand.stand.running.opening.to_ambient import to_ambient
 from thermostand.stand.running.order import Order, check_plan
 from thermostand.stand.running.resume import Interruption, begun, plan_hash
-from thermostand.stand.running.run_desk import RunDesk
 from thermostand.stand.running.session_report import DECIDES
 from thermostand.stand.running.status import StatusBoard
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.api.server import preload, serve
+from thermostand.stand.serving.api.server import preload
 from thermostand.stand.serving.eta_slip import EtaSlip
 
 # The recorder's events that hold a run, and those that let it continue.
@@ -63,6 +61,9 @@ _HOLDING: dict[str, str] = {FRAMES_STOPPED: DISK_LOW, TELEMETRY_NOT_SAVED: NOT_R
 # A run in virtual time that is held for so many times the longest pause ends.
 _VIRTUAL_PAUSES = 2
 _RELEASING: dict[str, str] = {FRAMES_RESUMED: DISK_LOW, TELEMETRY_SAVED_AGAIN: NOT_RECORDED}
+
+
+Work = Coroutine[None, None, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,20 +84,21 @@ class Job:
 class Guest:
     """A run on an open stand: it reads, begins its journal, performs its plan and leaves the stand safe.
 
-    board, executor: what is published of the run, and what changes its plan; desk: what may be asked of it. None before
-    its journal is begun.
+    answer: tells clients about it from the beginning of its journal on, when it has the stand for itself. course: what
+    may be asked of it, None before that.
     """
 
-    def __init__(self, job: Job, open_stand: OpenStand, recorder: Recorder, stop: Stop) -> None:
+    def __init__(
+        self, job: Job, open_stand: OpenStand, recorder: Recorder, stop: Stop, answer: Callable[[], Work] | None = None
+    ) -> None:
         assembly, plan, before = open_stand.assembly, tuple(job.order.recipe.plan()), job.before
         load_for(plan)
         self.job = job
         self.recorder = recorder
         self.stop = stop
         self.log = Logbook(assembly.hub, assembly.clock, fold(plan, ()) if before is None else before.state)
-        self.board: StatusBoard | None = None
-        self.executor: Executor | None = None
-        self.desk: RunDesk | None = None
+        self.course: Course | None = None
+        self._answer = answer
         self._open_stand = open_stand
         self._assembly = assembly
         assembly.stand.attended = job.order.attended
@@ -129,11 +131,9 @@ class Guest:
         async with AsyncExitStack() as leaving:
             try:
                 executor = await watched(self._begun(settling, leaving), (*open_stand.tasks, recording))
-                self.board = await self._board(leaving)
-                self.executor = executor
-                self.desk = self._desk(self.board, executor, leaving)
-                if open_stand.is_for_one:
-                    watchers.append(asyncio.create_task(self._answer(self.desk)))
+                self.course = self._course(await self._board(leaving), executor, leaving)
+                if self._answer is not None:
+                    watchers.append(asyncio.create_task(self._answer()))
                 open_stand.start()
                 if isinstance(assembly.clock, VirtualClock):
                     limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
@@ -236,38 +236,14 @@ class Guest:
             leaving.callback(assembly.hub.unsubscribe, slip)
         return board
 
-    def _desk(self, board: StatusBoard, executor: Executor, leaving: AsyncExitStack) -> RunDesk:
-        """What may be asked of the run."""
-        assembly, directory, open_stand = self._assembly, self.recorder.directory, self._open_stand
-        notes = DiskCalls(self.recorder.disk, NOTES_LINE, assembly.clock)
+    def _course(self, board: StatusBoard, executor: Executor, leaving: AsyncExitStack) -> Course:
+        assembly, recorder = self._assembly, self.recorder
+        notes = DiskCalls(recorder.disk, NOTES_LINE, assembly.clock)
         leaving.callback(notes.close)
-        desk = RunDesk(
-            assembly,
-            directory,
-            self.stop,
-            self.log,
-            executor,
-            board.status,
-            lambda: open_stand.latched,
-            open_stand.cleared,
-            notes,
-            board.eta,
-        )
-        assembly.hub.subscribe(desk)
-        leaving.callback(assembly.hub.unsubscribe, desk)
-        return desk
-
-    async def _answer(self, desk: RunDesk) -> None:
-        """Answer clients until cancelled; a run can do without any."""
-        assembly, directory, name = self._assembly, self.recorder.directory, self.job.order.config.name
-        try:
-            async with serve(
-                desk, assembly.hub, assembly.clock, directory, name, Interface(directory.parent), self.stop.patience
-            ):
-                await asyncio.Event().wait()
-        except StandError as error:
-            self.log.tell(NO_CONTROL, f"the run cannot be queried or paused: {error}")
-            await asyncio.Event().wait()
+        course = Course(assembly, recorder.directory, self.stop, self.log, executor, board, notes)
+        assembly.hub.subscribe(course)
+        leaving.callback(assembly.hub.unsubscribe, course)
+        return course
 
     def _begin_data(self) -> dict[str, object]:
         """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For

@@ -12,8 +12,7 @@ from thermostand.stand.running.memory.entries import edited
 from thermostand.stand.running.memory.fold import after, refusal
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.order import plan_faults
-from thermostand.stand.serving.desk import WrittenStep
-from thermostand.stand.serving.plan_faults import PlanCheck, StepFault
+from thermostand.stand.serving.desk import PlanCheck, StepFault, WrittenStep
 
 _SET_POINT = "chamber_degC"
 

@@ -31,7 +31,7 @@ class Said:
             check_tag(tag)
 
 
-async def keep(said: Said, session: Path, hub: Hub, clock: Clock, notes: DiskCalls) -> None:
+async def keep(said: Said, session: Path, notes: DiskCalls, hub: Hub, clock: Clock) -> None:
     """Durable when this returns; SessionError when it is not. `notes` touches the disk, which may hang."""
     await notes.call(_keep, said, session, clock.now_ns())
     who, tags = said.who, list(said.tags)

@@ -1,42 +1,29 @@
-"""What can be asked of a stand, and the values in which it answers: where daemon, HTTP interface, page and command line
-meet.
+"""The values in which a stand answers: where daemon, HTTP interface, page and command line meet.
 
-`Desk` is on the side of the control loop. Everything else sees the values below: they are immutable, they are what the
-published OpenAPI document describes, and an instant in them is ns since the epoch on the stand's clock, to which
-`utc_offset_ns` is added for UTC.
+They are immutable, they are what the published OpenAPI document describes, and an instant in them is ns since the epoch
+on the stand's clock, to which `utc_offset_ns` is added for UTC. One more field of the state is one of StandState, and
+its value: in `seen_state`, or in `state` of the service when it is of a run or a daemon.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Protocol
+import importlib.metadata
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
+from thermostand.foundation.clock import Clock, utc_offset_ns
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import StandError
-from thermostand.foundation.readings import Cause, Quality
+from thermostand.foundation.readings import Cause, Quality, Reading
 from thermostand.recording.reading.notes import LONGEST_NOTE, TAG
-from thermostand.stand.serving.not_confirmed import NotConfirmed
-from thermostand.stand.serving.plan_faults import PlanCheck
 
-# Verbs of a command's event, in the words of the interface.
-Verb = Literal[
-    "pause",
-    "continue",
-    "clear",
-    "stop",
-    "skip",
-    "extend",
-    "edit",
-    "submit",
-    "cancel",
-    "move",
-    "resume",
-    "device",
-    "note",
-    "fault",
-]
+if TYPE_CHECKING:
+    from thermostand.foundation.hub import Hub
+    from thermostand.stand.config.stand_config import StandConfig
+    from thermostand.stand.stand import Stand
+
 # socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. network: TCP without one,
 # which STOP needs not. secop: SECoP on this machine. terminal: a signal or key.
 How = Literal["socket", "loopback", "token", "network", "secop", "terminal", "queue"]
@@ -176,6 +163,19 @@ class QueuedRun(Value):
     added_by: str = ""
 
 
+class NotConfirmed(Value):
+    """It is tried again until it confirms. name: of the device, or of its relay. since_ns: when its safe state was
+    demanded. reason: why the last try did not confirm it, "" while the first one is under way. timer_s: of the relays
+    of heat and cold, how long after since_ns the board's own timer has switched them off all the same; None where there
+    is none.
+    """
+
+    name: str
+    since_ns: int
+    reason: str = ""
+    timer_s: float | None = None
+
+
 class HeatByHand(Value):
     """Heat and cold that somebody ordered between runs. setpoint_degC: as it was ordered, also while the regulator does
     not answer; since_ns: when they were permitted; cut_ns: when the relay board's own timer ended them, because it
@@ -233,7 +233,7 @@ class Done(Value):
     """The answer to a command. reasons: what holds the run now; moving: what is still under way, as in
     `linear to 250 mm`; text: what came of it, in a sentence; seq: of the command's event in the stream."""
 
-    verb: Verb
+    verb: str
     text: str = ""
     reasons: tuple[str, ...] = ()
     moving: tuple[str, ...] = ()
@@ -245,6 +245,31 @@ class WrittenStep(Value):
 
     kind: str = Field(max_length=100)
     parameters: dict[str, JsonValue] = Field(default_factory=dict)
+
+
+class PlanRequest(Document):
+    """The steps from a place on are replaced by these."""
+
+    from_index: int = Field(ge=0, le=1_000_000)
+    steps: tuple[WrittenStep, ...] = Field(max_length=10_000)
+
+
+class StepFault(Value):
+    """Why the plan cannot be so. index: of the step in the plan, None when it is the plan as a whole."""
+
+    index: int | None
+    text: str
+
+
+class PlanCheck(Value):
+    """faults: what is wrong, none when the steps would be taken; duration_s: how long they take then, else None.
+    texts: each of them in words, "" of one that is no step. set_points_degC: of the chamber at each of them, None while
+    it is stopped."""
+
+    faults: tuple[StepFault, ...] = ()
+    duration_s: float | None = None
+    texts: tuple[str, ...] = ()
+    set_points_degC: tuple[float | None, ...] = ()
 
 
 # Checked, with a sentence, where it is kept.
@@ -323,88 +348,67 @@ class FaultRequest(Document):
     mend: bool = Field(default=False, strict=True)
 
 
-class Desk(Protocol):
-    """What can be asked of a stand. All of it is called on the control loop and returns quickly: no method waits for a
-    wire, and what waits for a disk is `async` and stands in nobody's way.
+def seen_state(config: StandConfig, stand: Stand, hub: Hub, clock: Clock) -> StandState:
+    """A stand on which nothing is run, as its devices were last read."""
+    readings = hub.readings
+    heat_percent, cool_percent = _value(readings.get("regulator.mv_heat")), _value(readings.get("regulator.mv_cool"))
+    output_percent = None if heat_percent is None else heat_percent - (cool_percent or 0.0)
+    return StandState(
+        stand=config.name,
+        version=_version(),
+        simulated=config.simulation is not None,
+        now_ns=clock.now_ns(),
+        utc_offset_ns=utc_offset_ns(clock),
+        phase="idle",
+        reasons=tuple(sorted(stand.gate.reasons)),
+        not_confirmed=_not_confirmed(stand),
+        readings={channel: _reading(reading) for channel, reading in readings.items()},
+        setpoint_degC=_value(readings.get("regulator.sp")) if _value(readings.get("regulator.running")) else None,
+        output_percent=output_percent,
+        heater_permitted=stand.chamber.permits.granted,
+        compressor_on=bool(_value(readings.get("relays.compressor"))),
+        camera_on=stand.imaging.supply.is_on,
+        flap=_flap(config, stand),
+        axes={name: _value(readings.get(f"{name}.position")) for name in stand.devices.axes},
+        moving=tuple(stand.motions.texts),
+        busy=stand.motions.names,
+    )
 
-    Each command publishes an event of kind COMMAND (command_event.py) and then does what it says, or raises Conflict
-    when the state forbids it, Missing, or ConfigError when the request itself is wrong. `stop` never raises.
-    """
 
-    def state(self) -> StandState:
-        """As it is now."""
-        ...
+def _not_confirmed(stand: Stand) -> tuple[NotConfirmed, ...]:
+    permits = stand.chamber.permits
+    return tuple(
+        NotConfirmed(
+            name=each.name,
+            since_ns=each.since_ns,
+            reason=each.failure,
+            timer_s=permits.timer_s if each.name == permits.name else None,
+        )
+        for each in stand.safety.pending
+    )
 
-    def plan(self) -> tuple[PlanStep, ...]:
-        """The plan in force; empty when nothing is run. With `check_edit` what any thread may call: a long plan takes a
-        while, so it reads values only that are replaced and never changed."""
-        ...
 
-    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
-        """What `edit` would say; changes nothing. Any thread may call it, as `plan`. Conflict when nothing is run."""
-        ...
+def _flap(config: StandConfig, stand: Stand) -> str:
+    if config.flap is None:
+        return "none"
+    return "moving" if stand.motions.moves("flap") else "open" if stand.imaging.flap_open else "closed"
 
-    def devices(self) -> tuple[DeviceState, ...]:
-        """The commands that devices take by hand."""
-        ...
 
-    def pause(self, who: Who, when: When = "now") -> Done:
-        """Hold the run before its next action, or when the step under way is done."""
-        ...
+def _value(reading: Reading | None) -> float | None:
+    return None if reading is None or reading.quality is Quality.BAD else reading.value
 
-    def continue_(self, who: Who) -> Done:
-        """End a pause."""
-        ...
 
-    def clear(self, who: Who) -> Done:
-        """An operator has removed the cause of a trip."""
-        ...
+def _reading(reading: Reading) -> ReadingState:
+    return ReadingState.model_construct(
+        value=_value(reading),
+        unit=reading.unit,
+        quality=reading.quality,
+        time_ns=reading.time_ns,
+        reason=reading.reason,
+        cause=reading.cause,
+    )
 
-    def stop(self, who: Who) -> Done:
-        """Make the stand safe and end the run, if there is one; in every state, as often as it is asked for."""
-        ...
 
-    async def skip(self, who: Who, step_id: str) -> Done:
-        """Leave a step out, or break it off; durable when this returns."""
-        ...
-
-    async def extend(self, who: Who, step_id: str, by_s: float) -> Done:
-        """Soak for so much longer; durable when this returns."""
-        ...
-
-    async def edit(self, who: Who, from_index: int, steps: Sequence[WrittenStep]) -> Done:
-        """Replace the steps from a place on, none of which was begun; durable when this returns."""
-        ...
-
-    async def submit(self, who: Who, order: RunRequest, key: str = "") -> QueuedRun:
-        """Check a run and queue it; with a key of an earlier one, that one. Conflict when its request was another."""
-        ...
-
-    async def cancel(self, who: Who, run: int) -> Done:
-        """Take a run out of the queue."""
-        ...
-
-    async def move(self, who: Who, run: int, to: int) -> Done:
-        """Make a run the `to`-th of those to be done; 1 is the next."""
-        ...
-
-    async def resume(self, who: Who, session: str) -> Done:
-        """Resume the interrupted run of a session."""
-        ...
-
-    async def device(self, who: Who, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> Done:
-        """Tell a device something by hand, through the same gate as a run; Conflict while a run owns the stand."""
-        ...
-
-    async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
-        """Add an operator's note and tags to a session, running or finished."""
-        ...
-
-    async def known_faults(self) -> SimulatedFaults:
-        """What can be broken on purpose; Conflict when the stand is no simulated one."""
-        ...
-
-    async def break_(self, who: Who, request: FaultRequest) -> Done:
-        """Break something of a simulated laboratory, or mend it, in a run as well; Conflict when the stand is a real
-        one."""
-        ...
+@cache
+def _version() -> str:
+    return importlib.metadata.version("thermostand")

@@ -14,6 +14,7 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 from tests.bench import abort, jitter
@@ -24,16 +25,13 @@ from thermostand.drivers.framing.aravis_library import library
 from thermostand.foundation.errors import StandError
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.running.memory.fold import fold
-from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.opening.stop import Interrupted, Stop
-from thermostand.stand.running.run_desk import RunDesk
+from thermostand.stand.service import StandService
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve
 from thermostand.stand.serving.client import Server, server_of
-from thermostand.stand.serving.desk import Done, StandState, Who
+from thermostand.stand.serving.desk import Who
 from thermostand.stand.serving.presence import living
-from thermostand.stand.serving.seen import seen_state
 from thermostand.stand.stand import Stand
 
 VIEWERS = 10
@@ -73,15 +71,14 @@ def figures(directory: Path) -> list[Figure]:
     ]
 
 
-class _Desk(RunDesk):
+class _Service(StandService):
     """Of a stand on which nothing is run but the stop."""
 
-    def state(self) -> StandState:
-        return seen_state(self.assembly.config, self.assembly.stand, self.assembly.hub, self.assembly.clock)
+    stop_run: Stop
 
-    def stop(self, who: Who) -> Done:
+    def stop(self, who: Who) -> str:
         self.stop_run()
-        return Done(verb="stop")
+        return ""
 
 
 _Times = tuple[list[float], list[float]]  # of stops, and of a process that only waited meanwhile
@@ -89,22 +86,20 @@ _Times = tuple[list[float], list[float]]  # of stops, and of a process that only
 
 async def _stops(config: StandConfig, session: Path) -> tuple[_Times, _Times]:
     async with abort.polled(config) as (assembly, control):
-        nothing = cast("Any", None)
-        log = Logbook(assembly.hub, assembly.clock, fold((), ()))
-        desk = _Desk(assembly, session, Stop(), log, nothing, nothing, nothing, nothing, nothing, nothing)
+        service = _Service(cast("Any", SimpleNamespace(assembly=assembly, guest=None, latched=None)))
 
         async def by_command(stand: Stand, _: Assembly) -> float:
             begun_s = math.nan
             with suppress(Interrupted):
                 async with Stop() as stop:
                     stop.watch(stand)
-                    desk.stop_run = stop
+                    service.stop_run = stop
                     begun_s = time.perf_counter()
                     await asyncio.to_thread(server.order, "stop")
                     await asyncio.Event().wait()
             return begun_s
 
-        async with serve(desk, assembly.hub, assembly.clock, session, config.name, Interface(session.parent)):
+        async with serve(service, session, config.name, Interface(session.parent)):
             server: Server = server_of(session)
             await asyncio.to_thread(server.state, 30.0)  # everything is imported
             with waiting() as alone_waited_ms:

@@ -23,7 +23,7 @@ from types import FrameType
 from tests.system.simulated_orders import simulated_order
 from thermostand.foundation import calls
 from thermostand.foundation.items import Item, StepMark, StepState
-from thermostand.stand.running.run import Interrupted, StandTripped, run_real
+from thermostand.stand.run import Interrupted, StandTripped, run_real
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Mapping, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from pydantic import JsonValue
 
 from thermostand.experiments.steps import Soak, number_steps
 from thermostand.foundation.clock import WallClock
+from thermostand.foundation.documents import Document
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
@@ -18,9 +19,23 @@ from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.gate import INTERLOCK, OPERATOR, Gate
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.plan_check import check_edit
+from thermostand.stand.service import (
+    CancelRequest,
+    DeviceRequest,
+    ExtendRequest,
+    MoveRequest,
+    NoteRequest,
+    PauseRequest,
+    ResumeRequest,
+    SkipRequest,
+    StandService,
+    SubmitRequest,
+    held_text,
+    pause_text,
+)
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve
-from thermostand.stand.serving.command_event import command_event
+from thermostand.stand.serving.commands import Served, recorded
 from thermostand.stand.serving.desk import (
     Conflict,
     DeviceState,
@@ -30,6 +45,9 @@ from thermostand.stand.serving.desk import (
     HeatByHand,
     KnownFault,
     Missing,
+    NotConfirmed,
+    PlanCheck,
+    PlanRequest,
     PlanStep,
     QueuedRun,
     ReadingState,
@@ -37,13 +55,9 @@ from thermostand.stand.serving.desk import (
     RunStatus,
     SimulatedFaults,
     StandState,
-    Verb,
-    When,
     Who,
     WrittenStep,
 )
-from thermostand.stand.serving.not_confirmed import NotConfirmed
-from thermostand.stand.serving.plan_faults import PlanCheck
 
 STAND = "a stand"
 KNOWN_FAULTS = (
@@ -52,21 +66,20 @@ KNOWN_FAULTS = (
 )
 
 
-class ADesk:
+class ADesk(StandService):
     """Commands change a gate and a list; `orders` has who gave which."""
 
     def __init__(self, *reasons: str, run: RunStatus | None = None) -> None:
-        self.hub = Hub()
-        self.clock = WallClock()
+        Served.__init__(self, Hub(), WallClock())  # there is no stand
         self.gate = Gate()
         for reason in reasons:
             self.gate.hold(reason)
         self.run = run
         self.by_hand: HeatByHand | None = None
-        self.fault: FaultState | None = None
+        self.tripped: FaultState | None = None
         self.not_confirmed: tuple[NotConfirmed, ...] = ()
         self.moving: tuple[str, ...] = ()
-        self.orders: list[tuple[Who, Verb, dict[str, JsonValue]]] = []
+        self.orders: list[tuple[Who, str, dict[str, JsonValue]]] = []
         self.queue: list[QueuedRun] = []
         self.is_simulated = True
         self.edited: tuple[WrittenStep, ...] = ()
@@ -95,7 +108,7 @@ class ADesk:
             run=self.run,
             reasons=tuple(sorted(self.gate.reasons)),
             by_hand=self.by_hand,
-            fault=self.fault,
+            fault=self.tripped,
             not_confirmed=self.not_confirmed,
             readings={
                 name: ReadingState(
@@ -121,38 +134,47 @@ class ADesk:
     def devices(self) -> tuple[DeviceState, ...]:
         return (DeviceState(name="flap", kind="flap"),)
 
-    def pause(self, who: Who, when: When = "now") -> Done:
+    def done(self, verb: str, text: str) -> Done:
+        return Done(verb=verb, text=text, reasons=tuple(sorted(self.gate.reasons)), moving=self.moving)
+
+    def record(self, who: Who, name: str, given: Document | None, result: str = "done") -> None:
+        super().record(who, name, given, result)
+        if result == "done":
+            self.orders.append((who, name, recorded(given)))
+
+    def pause(self, who: Who, given: PauseRequest) -> str:
         self.gate.hold(OPERATOR)
-        return self._done(who, "pause", {"when": when})
+        return pause_text(given.when)
 
-    def continue_(self, who: Who) -> Done:
+    def continue_(self, who: Who) -> str:
         self.gate.clear(OPERATOR)
-        return self._done(who, "continue", {})
+        return held_text(self.gate.reasons)
 
-    def clear(self, who: Who) -> Done:
+    def clear(self, who: Who) -> str:
         if INTERLOCK not in self.gate.reasons:
             raise Conflict("there is nothing to clear: no interlock holds this run")
         self.gate.clear(INTERLOCK)
-        return self._done(who, "clear", {})
+        return ""
 
-    def stop(self, who: Who) -> Done:
-        return self._done(who, "stop", {})
+    def stop(self, who: Who) -> str:
+        return ""
 
-    async def skip(self, who: Who, step_id: str) -> Done:
-        if step_id != "0-soak":
+    async def skip(self, who: Who, given: SkipRequest) -> str:
+        if given.step_id not in ("0-soak", "1"):
             raise Missing("the plan has no such step")
-        return self._done(who, "skip", {"step_id": step_id})
+        return f"step {given.step_id} is left out"
 
-    async def extend(self, who: Who, step_id: str, by_s: float) -> Done:
-        if step_id != "0-soak":
+    async def extend(self, who: Who, given: ExtendRequest) -> str:
+        if given.step_id not in ("0-soak", "1"):
             raise Missing("the plan has no such step")
-        return self._done(who, "extend", {"step_id": step_id, "by_s": by_s})
+        return f"step {given.step_id} takes {given.by_s / 60:g} min longer"
 
-    async def edit(self, who: Who, from_index: int, steps: Sequence[WrittenStep]) -> Done:
-        self.edited = tuple(steps)
-        return self._done(who, "edit", {"from_index": from_index, "steps": len(steps)})
+    async def edit(self, who: Who, given: PlanRequest) -> str:
+        self.edited = given.steps
+        return ""
 
-    async def submit(self, who: Who, order: RunRequest, key: str = "") -> QueuedRun:
+    async def submit(self, who: Who, given: SubmitRequest) -> QueuedRun:
+        key, order = given.key, RunRequest.model_validate(given.model_dump(exclude={"key"}))
         if key and key in self.requests:
             before, run = self.requests[key]
             if before != order:
@@ -162,54 +184,48 @@ class ADesk:
         run = QueuedRun(id=number, recipe=order.recipe or "written", state="waiting", added_ns=now_ns, key=key)
         self.queue.append(run)
         self.requests[key] = order, run
-        self._done(who, "submit", {"recipe": run.recipe})
         return run
 
-    async def cancel(self, who: Who, run: int) -> Done:
-        self._run(run)
-        self.queue = [each for each in self.queue if each.id != run]
-        return self._done(who, "cancel", {"run": run})
+    async def cancel(self, who: Who, given: CancelRequest) -> str:
+        self._check_run(given.run)
+        self.queue = [each for each in self.queue if each.id != given.run]
+        return ""
 
-    async def move(self, who: Who, run: int, to: int) -> Done:
-        self._run(run)
-        return self._done(who, "move", {"run": run, "to": to})
+    async def move(self, who: Who, given: MoveRequest) -> str:
+        self._check_run(given.run)
+        return ""
 
-    async def resume(self, who: Who, session: str) -> Done:
+    async def resume(self, who: Who, given: ResumeRequest) -> str:
         raise Conflict("a run has the stand")
 
-    async def device(self, who: Who, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> Done:
-        if name != "flap":
+    async def device(self, who: Who, given: DeviceRequest) -> str:
+        if given.device != "flap":
             raise Missing("there is no such device")
-        return self._done(who, "device", {"name": name, "verb": verb, "arguments": dict(arguments)})
+        return ""
 
-    async def note(self, who: Who, session: str, text: str, tags: Sequence[str]) -> Done:
-        return self._done(who, "note", {"session": session, "text": text, "tags": list(tags)})
+    async def note(self, who: Who, given: NoteRequest) -> str:
+        return ""
 
     async def known_faults(self) -> SimulatedFaults:
         return SimulatedFaults(faults=KNOWN_FAULTS, standing=dict(self.standing))
 
-    async def break_(self, who: Who, request: FaultRequest) -> Done:
-        if request.name not in {each.name for each in KNOWN_FAULTS}:
-            raise Missing(f"there is no fault {request.name}")
-        if request.mend:
-            self.standing.pop(request.name, None)
+    async def fault(self, who: Who, given: FaultRequest) -> str:
+        if given.name not in {each.name for each in KNOWN_FAULTS}:
+            raise Missing(f"there is no fault {given.name}")
+        if given.mend:
+            self.standing.pop(given.name, None)
         else:
-            self.standing[request.name] = request.value
-        return self._done(who, "fault", request.model_dump())
+            self.standing[given.name] = given.value
+        return ""
 
-    def _run(self, number: int) -> None:
+    def _check_run(self, number: int) -> None:
         if all(run.id != number for run in self.queue):
             raise Missing(f"no run {number} in the queue")
-
-    def _done(self, who: Who, verb: Verb, arguments: dict[str, JsonValue]) -> Done:
-        self.orders.append((who, verb, arguments))
-        self.hub.publish(command_event(self.clock.now_ns(), who, verb, arguments))
-        return Done(verb=verb, reasons=tuple(sorted(self.gate.reasons)), moving=self.moving)
 
 
 @asynccontextmanager
 async def served(desk: ADesk, session: Path, interface: Interface | None = None) -> AsyncGenerator[ADesk]:
     """The desk, served for that session while inside, and once it answers."""
-    async with serve(desk, desk.hub, desk.clock, session, STAND, interface or Interface(session.parent)):
+    async with serve(desk, session, STAND, interface or Interface(session.parent)):
         await asyncio.sleep(0)
         yield desk

@@ -25,25 +25,24 @@ from thermostand.stand.gate import INTERLOCK, OPERATOR
 from thermostand.stand.running.memory.entries import Step as StepMarked
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.plan_check import check_edit
+from thermostand.stand.service import ExtendRequest, PauseRequest, SkipRequest
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.desk import (
     Argument,
     DeviceState,
     DeviceVerb,
-    Done,
     FaultState,
+    PlanCheck,
     PlanStep,
     PromptState,
     QueuedRun,
     RunStatus,
     StandState,
     StepStanding,
-    When,
     Who,
     WrittenStep,
 )
 from thermostand.stand.serving.page_room import PageRoom
-from thermostand.stand.serving.plan_faults import PlanCheck
 from thermostand.stand.serving.viewing import Viewing
 
 TARGET = (Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml").read_text("utf-8")
@@ -63,7 +62,6 @@ class NightDesk(ADesk):
 
     def __init__(self) -> None:
         super().__init__()
-        self.fault: FaultState | None = None
         self.prompt: PromptState | None = None
         self.is_idle = False
         self.pausing = False
@@ -116,11 +114,10 @@ class NightDesk(ADesk):
                 "phase": phase,
                 "run": None if self.is_idle else run,
                 "reasons": reasons,
-                "fault": self.fault,
                 "prompt": self.prompt,
                 "setpoint_degC": None if self.lost == "regulator" else set_point_degC(self.now_s()),
                 "output_percent": values.get("regulator.mv_heat"),
-                "heater_permitted": self.is_heat_permitted and not self.fault,
+                "heater_permitted": self.is_heat_permitted and not self.tripped,
                 "compressor_on": bool(values.get("relays.compressor")),
                 "pausing": self.pausing,
                 "camera_on": True,
@@ -199,35 +196,35 @@ class NightDesk(ADesk):
             DeviceState(name="camera", kind="camera", verbs=(DeviceVerb(verb="frame", text="Take one frame"),)),
         )
 
-    def pause(self, who: Who, when: When = "now") -> Done:
-        self.pausing = when == "step"
-        return self._done(who, "pause", {"when": when}) if self.pausing else super().pause(who, when)
+    def pause(self, who: Who, given: PauseRequest) -> str:
+        self.pausing = given.when == "step"
+        return "" if self.pausing else super().pause(who, given)
 
-    def continue_(self, who: Who) -> Done:
+    def continue_(self, who: Who) -> str:
         self.prompt, self.pausing = None, False
         return super().continue_(who)
 
-    def clear(self, who: Who) -> Done:
+    def clear(self, who: Who) -> str:
         done = super().clear(who)
-        self.fault = None
+        self.tripped = None
         return done
 
-    async def skip(self, who: Who, step_id: str) -> Done:
-        return self._done(who, "skip", {"step_id": step_id})
+    async def skip(self, who: Who, given: SkipRequest) -> str:
+        return ""
 
-    async def extend(self, who: Who, step_id: str, by_s: float) -> Done:
-        return self._done(who, "extend", {"step_id": step_id, "by_s": by_s})
+    async def extend(self, who: Who, given: ExtendRequest) -> str:
+        return ""
 
-    def stop(self, who: Who) -> Done:
+    def stop(self, who: Who) -> str:
         self.stops += 1
-        return self._done(who, "stop", {}).model_copy(update={"text": "the stand is made safe"})
+        return "the stand is made safe"
 
     def trip(self) -> None:
         """The air is too warm."""
         self.gate.hold(INTERLOCK)
         text = "thermometers.air is at 71.2 degC, above 70 degC"
         data = {"channel": "thermometers.air", "value": 71.2, "limit": 70.0, **Fault("air_too_warm", text).data}
-        self.fault = FaultState(rule="air_too_warm", text=text, since_ns=self.clock.now_ns(), data=data)
+        self.tripped = FaultState(rule="air_too_warm", text=text, since_ns=self.clock.now_ns(), data=data)
         self.hub.publish(Event(self.clock.now_ns(), "error", "tripped", text, data))
 
     def ask_operator(self, text: str) -> None:

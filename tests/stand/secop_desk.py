@@ -2,24 +2,21 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator
 from pathlib import Path
-
-from pydantic import JsonValue
 
 from tests.addresses import free_port
 from tests.stand.a_desk import ADesk, served
 from thermostand.foundation.errors import DeviceFault, Refused, Unreachable
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.stand.service import DeviceRequest
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.desk import (
     Argument,
     Conflict,
     DeviceState,
     DeviceVerb,
-    Done,
-    FaultState,
     StandState,
     Who,
 )
@@ -41,7 +38,6 @@ class SecopDesk(ADesk):
         self.linear_mm = 0.0
         self.flap = "closed"
         self.phase = "idle"
-        self.fault: FaultState | None = None
         self.busy: tuple[str, ...] = ()
         self.is_slow = False
         self.fails: Exception | None = None
@@ -78,7 +74,6 @@ class SecopDesk(ADesk):
                 "axes": {"linear": self.linear_mm},
                 "flap": self.flap,
                 "phase": self.phase,
-                "fault": self.fault,
                 "busy": self.busy,
             }
         )
@@ -94,7 +89,8 @@ class SecopDesk(ADesk):
             _device("camera", "camera", ("camera.temperature",), _verb("on"), _verb("off")),
         )
 
-    async def device(self, who: Who, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> Done:
+    async def device(self, who: Who, given: DeviceRequest) -> str:
+        name, verb, arguments = given.device, given.verb, given.arguments
         if self.phase != "idle":
             raise Conflict("a run has the stand; `stand stop` ends it")
         if self.fails is not None:
@@ -110,7 +106,7 @@ class SecopDesk(ADesk):
                 self.flap = "open" if verb == "open" else "closed"
             case _:
                 pass
-        return self._done(who, "device", {"device": name, "verb": verb, "arguments": dict(arguments)})
+        return ""
 
     async def _moved(self, position_mm: float) -> None:
         if self.is_slow:

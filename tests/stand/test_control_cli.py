@@ -16,7 +16,8 @@ from tests.host import Host
 from tests.stand.a_desk import ADesk, served
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Event
-from thermostand.stand.commands.control_cli import app, status_lines
+from thermostand.stand.commands.command_table import app as stand
+from thermostand.stand.commands.control_cli import status_lines
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.estimating.run_estimate import Night
 from thermostand.stand.gate import Gate
@@ -24,8 +25,7 @@ from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.status import StatusBoard
 from thermostand.stand.serving.api.access import user_name
-from thermostand.stand.serving.desk import FaultState, RunStatus
-from thermostand.stand.serving.not_confirmed import NotConfirmed
+from thermostand.stand.serving.desk import FaultState, NotConfirmed, RunStatus
 
 runner = CliRunner()
 
@@ -48,7 +48,7 @@ STATUS = RunStatus(
 
 
 async def invoke(*arguments: str | Path) -> Result:
-    return await asyncio.to_thread(runner.invoke, app, [str(argument) for argument in arguments])
+    return await asyncio.to_thread(runner.invoke, stand, [str(argument) for argument in arguments])
 
 
 def session(root: Path, name: str) -> Path:
@@ -142,13 +142,13 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         assert nothing.exit_code == 1
         assert "nothing to clear" in nothing.stderr
         desk.gate.hold("interlock")
-        desk.fault = FaultState(rule="stage_alarm", text="the stage is in alarm", since_ns=0)
+        desk.tripped = FaultState(rule="stage_alarm", text="the stage is in alarm", since_ns=0)
         again = await invoke("clear", tmp_path)
         assert "held again: stage_alarm: the stage is in alarm" in again.stdout
         assert "when the step under way is done" in (await invoke("pause", tmp_path, "--at-next-step")).stdout
         assert (await invoke("skip", "1", tmp_path)).stdout == f"{path}: step 1 is left out\n"
         assert (await invoke("extend", "0-soak", "30", tmp_path)).stdout == f"{path}: step 0-soak takes 30 min longer\n"
-        assert (await invoke("skip", "7", tmp_path)).exit_code == 2
+        assert (await invoke("skip", "7", tmp_path)).exit_code == 1
         assert json.loads((await invoke("stop", path, "--json")).stdout)["verb"] == "stop"
     orders = [(verb, arguments) for _, verb, arguments in desk.orders]
     assert orders == [
@@ -157,7 +157,7 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         ("clear", {}),
         ("clear", {}),
         ("pause", {"when": "step"}),
-        ("skip", {"step_id": "0-soak"}),
+        ("skip", {"step_id": "1"}),
         ("extend", {"step_id": "0-soak", "by_s": 1800.0}),
         ("stop", {}),
     ]
@@ -170,7 +170,7 @@ async def test_the_plan_and_what_happens_are_shown(tmp_path: Path):
         assert (await invoke("status", path, "--plan")).stdout == "    1  waiting     soak\n"
 
 
-@pytest.mark.parametrize(("moving", "said"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "nothing")])
+@pytest.mark.parametrize(("moving", "said"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "paused")])
 async def test_a_pause_says_what_still_moves(tmp_path: Path, moving: tuple[str, ...], said: str):
     path, desk = session(tmp_path, "night"), ADesk(run=STATUS)
     desk.moving = moving

@@ -34,7 +34,7 @@ CHANGES_NOTHING = (STOP_PATH, CHECK_PATH, INVITE_PATH)
 EVIL = "http://evil.example"
 # What a proxy adds: such a request is from elsewhere, and needs a token.
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
-NAMES = {"run": "1", "name": "flap", "verb": "open"}
+NAMES = {"run": "1", "name": "flap", "device": "flap", "session": "night", "verb": "open"}
 UPGRADE = {
     "Connection": "Upgrade",
     "Upgrade": "websocket",

@@ -159,9 +159,9 @@ class Desk(ADesk):
         ended.set()
         return super().stop(who)
 
-    def pause(self, who, when="now"):
+    def pause(self, who, given):
         self.moving = (take_all(),)  # what clients that have left since held, too
-        return super().pause(who, when)
+        return super().pause(who, given)
 
 def take_all():
     try:

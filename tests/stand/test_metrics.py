@@ -16,7 +16,7 @@ _SAMPLE = re.compile(r'(thermostand_[a-z_]+)(\{([a-z_]+="(\\.|[^"\\\n])*",?)*\})
 
 async def page() -> str:
     desk = ADesk("operator", run=STATUS.model_copy(update={"end_ns": STATUS.now_ns + 60_000_000_000}))
-    bridge = Bridge(desk, desk.hub, desk.clock)
+    bridge = Bridge(desk)
     state = bridge.snapshot.state.model_copy(
         update={
             "stand": 'a "stand"\nof \\ours',

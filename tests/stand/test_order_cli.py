@@ -57,4 +57,4 @@ async def test_a_device_is_commanded_over_the_network(tmp_path: Path):
         assert (await invoke("device", "flap", "move", "to", *there)).exit_code == 2
     who, verb, arguments = desk.orders[0]
     assert (who.name, who.how, verb) == ("rose", "token", "device")
-    assert arguments == {"name": "flap", "verb": "move", "arguments": {"to": 0.5, "how": "gently"}}
+    assert arguments == {"device": "flap", "verb": "move", "arguments": {"to": 0.5, "how": "gently"}}

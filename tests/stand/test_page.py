@@ -15,8 +15,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Reading
 from thermostand.stand.gate import CAMERA_LOST
-from thermostand.stand.serving.desk import HeatByHand
-from thermostand.stand.serving.not_confirmed import NotConfirmed
+from thermostand.stand.serving.desk import HeatByHand, NotConfirmed
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
 

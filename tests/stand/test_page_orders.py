@@ -12,8 +12,7 @@ from thermostand.foundation.documents import parse_document
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.gate import NOT_RECORDED, OPERATOR
-from thermostand.stand.serving.desk import QueuedRun
-from thermostand.stand.serving.not_confirmed import NotConfirmed
+from thermostand.stand.serving.desk import NotConfirmed, QueuedRun
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
 
@@ -280,7 +279,7 @@ async def test_devices_take_orders_only_between_runs(night):
         flap = page.locator("section", has=page.get_by_role("heading", name="flap"))
         await flap.get_by_role("button", name="Open", exact=True).click()
         await until(lambda: night.orders)
-        assert night.orders[-1][2] == {"name": "flap", "verb": "open", "arguments": {}}
+        assert night.orders[-1][2] == {"device": "flap", "verb": "open"}
 
 
 async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(night):
@@ -294,7 +293,7 @@ async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(nigh
         await faults.get_by_role("button", name="mend flap.jam").click()
         await until(lambda: len(night.orders) == 2)
         broken, mended = (order[2] for order in night.orders)
-        assert broken == {"name": "flap.jam", "value": 1500, "for_s": 60.0, "mend": False}
+        assert broken == {"name": "flap.jam", "value": 1500, "for_s": 60.0}
         assert (mended["name"], mended["mend"]) == ("flap.jam", True)
         night.is_simulated = False
         await page.locator("#simulated").wait_for(state="hidden")

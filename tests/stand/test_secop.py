@@ -237,7 +237,7 @@ async def test_a_run_and_a_trip_refuse_orders_with_classes_of_their_own(tmp_path
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("change linear:target 3"))[2][0] == "IsBusy"
         desk.phase = "held"
-        desk.fault = FaultState(rule="air_too_warm", text="the air is at 71 degC", since_ns=0)
+        desk.tripped = FaultState(rule="air_too_warm", text="the air is at 71 degC", since_ns=0)
         desk.gate.hold(INTERLOCK)
         desk.tell("tripped")
         await talk.ask("activate")

@@ -25,7 +25,7 @@ from thermostand.foundation.items import Event
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.stop_thread import StopThread
 from thermostand.stand.serving.client import server_of
-from thermostand.stand.serving.desk import Done, Who
+from thermostand.stand.serving.desk import Who
 from thermostand.stand.serving.secop.door import door_at
 
 LIMIT_S = 5.0
@@ -187,7 +187,7 @@ async def test_a_stop_that_ends_the_daemon_is_answered(tmp_path: Path, way: str)
     ended = asyncio.Event()
 
     class Ending(ADesk):
-        def stop(self, who: Who) -> Done:
+        def stop(self, who: Who) -> str:
             ended.set()
             return super().stop(who)
 

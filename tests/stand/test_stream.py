@@ -121,7 +121,7 @@ async def test_a_client_that_reconnects_gets_what_was_missed_and_learns_what_is_
 
 async def test_a_viewer_who_does_not_read_loses_the_oldest_and_learns_of_it():
     desk = ADesk()
-    bridge = Bridge(desk, desk.hub, desk.clock)
+    bridge = Bridge(desk)
     stream = Stream(bridge)
     slow, quick = stream.join(None), stream.join(None)
     assert [json.loads(await viewer.next())["type"] for viewer in (slow, quick)] == ["state", "state"]
@@ -142,7 +142,7 @@ async def test_a_viewer_who_does_not_read_loses_the_oldest_and_learns_of_it():
 
 async def test_what_nobody_takes_is_dropped_and_counted():
     desk = ADesk()
-    bridge = Bridge(desk, desk.hub, desk.clock)
+    bridge = Bridge(desk)
     stream = Stream(bridge)
     for number in range(25_000):
         desk.tell(str(number))
@@ -153,7 +153,7 @@ async def test_what_nobody_takes_is_dropped_and_counted():
 
 async def test_a_control_loop_that_hangs_is_said_to_and_orders_time_out():
     desk = ADesk()
-    bridge = Bridge(desk, desk.hub, desk.clock)
+    bridge = Bridge(desk)
 
     async def never(_: object) -> None:
         await asyncio.Event().wait()

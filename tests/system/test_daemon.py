@@ -27,11 +27,11 @@ from thermostand.recording.reading.notes import read_notes
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.daemon.daemon_desk import DaemonDesk
 from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.guest import Guest
+from thermostand.stand.service import DeviceRequest, StandService, SubmitRequest
 from thermostand.stand.serving.client import Server, server_of
-from thermostand.stand.serving.desk import Conflict, RunRequest, StandState, Who
+from thermostand.stand.serving.desk import Conflict, StandState, Who
 
 LIMIT_S = 120.0  # for a busy machine
 BRIEF = """
@@ -390,20 +390,20 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
 
     of_other_tests = {id(found) for found in gc.get_objects() if isinstance(found, Guest)}  # whose failures hold them
 
-    async def until(desk: DaemonDesk, wanted: Callable[[StandState], bool]) -> None:
+    async def until(desk: StandService, wanted: Callable[[StandState], bool]) -> None:
         end_s = time.monotonic() + LIMIT_S
         while not wanted(desk.state()):
             assert time.monotonic() < end_s
             await asyncio.sleep(0.05)
 
     @asynccontextmanager
-    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+    async def front(desk: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
         daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
 
         async def work() -> None:
             telling = asyncio.create_task(tell(hub, clock))
             for number in (1, 2):
-                await desk.submit(who, RunRequest(recipe_text=BRIEF))
+                await desk.submit(who, SubmitRequest(recipe_text=BRIEF))
                 await until(desk, lambda state, done=number: states_of(state) == ["done"] * done)
                 await until(desk, is_idle)
                 subscribers.append(len(getattr(hub, "_subscribers")))  # noqa: B009 - as above
@@ -414,7 +414,7 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
             telling.cancel()
             await daemon.record.end()
             with pytest.raises(Conflict, match="no heat without a recording"):
-                await desk.device(who, "regulator", "set", {"setpoint_degC": 30.0})
+                await desk.device(who, DeviceRequest(device="regulator", verb="set", arguments={"setpoint_degC": 30.0}))
             assert not desk.state().heater_permitted
 
         working = asyncio.create_task(work())

@@ -17,8 +17,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.daemon_desk import DaemonDesk
 from thermostand.stand.daemon.serve import serve as serve_stand
+from thermostand.stand.service import StandService
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve as serve_clients
 from thermostand.stand.serving.client import server_of
@@ -60,7 +60,7 @@ async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
     late: list[str] = []
 
     @asynccontextmanager
-    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+    async def front(desk: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
         daemon: Daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
 
         async def until(wanted: Callable[[], bool]) -> None:
@@ -90,7 +90,7 @@ async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
             await asyncio.sleep(WATCHDOG_S)
             assert fed(manager) == 0  # the service manager will end a daemon whose guard does not look
 
-        async with serve_clients(desk, hub, clock, out, config.name, Interface(out)):
+        async with serve_clients(desk, out, config.name, Interface(out)):
             working = asyncio.create_task(work())
             working.add_done_callback(lambda _: daemon.leave())
             yield

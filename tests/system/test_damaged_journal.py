@@ -26,10 +26,10 @@ from thermostand.recording.reading.session import Session
 from thermostand.recording.reading.using import open_whole
 from thermostand.recording.repair.salvage import salvage_session
 from thermostand.recording.repair.verify import verify
+from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.memory.entries import Tripped
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
-from thermostand.stand.running.run import Interrupted, resume, run_virtual
 
 
 @pytest.fixture(autouse=True)

@@ -16,9 +16,9 @@ from thermostand.foundation.readings import bad_reading
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.daemon_desk import DaemonDesk
 from thermostand.stand.daemon.day_record import DayRecord
 from thermostand.stand.daemon.serve import serve as serve_stand
+from thermostand.stand.service import DeviceRequest, StandService
 from thermostand.stand.serving.desk import Who
 
 
@@ -42,7 +42,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
         return told[-1:] == [line]
 
     @asynccontextmanager
-    async def front(desk: DaemonDesk, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+    async def front(desk: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
         daemon: Daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
 
         async def until(wanted: Callable[[], bool]) -> None:
@@ -52,7 +52,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
 
         async def work() -> None:
             hub.subscribe(lambda item: reported.append(item) if isinstance(item, Event) else None)
-            await desk.device(who, "regulator", "set", {"setpoint_degC": 40.0})
+            await desk.device(who, DeviceRequest(device="regulator", verb="set", arguments={"setpoint_degC": 40.0}))
             await until(lambda: desk.state().heater_permitted)
             day[0] = "20261123"
             await until(lambda: daemon.record.is_of_today())

@@ -24,11 +24,11 @@ from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.daemon_desk import DaemonDesk
 from thermostand.stand.daemon.serve import serve
+from thermostand.stand.run import Interrupted, run_virtual
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.run import Interrupted, run_virtual
-from thermostand.stand.serving.desk import RunRequest, Who
+from thermostand.stand.service import StandService, SubmitRequest
+from thermostand.stand.serving.desk import Who
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
 QUICK = {"timeout_s": 0.1}
@@ -141,8 +141,8 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
     texts = {"config.yaml": text, "target.yaml": packaged("targets", ordered.config.target).read_text()}
     watcher = Watcher()
 
-    async def broken(daemon: Daemon, desk: DaemonDesk) -> None:
-        await desk.submit(Who(name="a test", how="terminal"), RunRequest(recipe_text=SOAK))
+    async def broken(daemon: Daemon, desk: StandService) -> None:
+        await desk.submit(Who(name="a test", how="terminal"), SubmitRequest(recipe_text=SOAK))
         await heater_is(ordered, 1)
         await fault(ordered, "bus.unplugged", True)
         daemon.leave()
@@ -152,7 +152,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
         assert tries
 
     @asynccontextmanager
-    async def front(desk: DaemonDesk, hub: Hub, _: WallClock) -> AsyncGenerator[None]:
+    async def front(desk: StandService, hub: Hub, _: WallClock) -> AsyncGenerator[None]:
         hub.subscribe(watcher)
         breaking = asyncio.create_task(broken(getattr(desk, "_daemon"), desk))  # noqa: B009 - what only a test may ask for
         yield

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 from tests.asking import ask
@@ -11,40 +12,43 @@ from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import Assembly
+from thermostand.stand.running.course import Course
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.run_desk import RunDesk
-from thermostand.stand.serving.desk import Who
+from thermostand.stand.service import PauseRequest, StandService
+from thermostand.stand.serving.desk import Done, Who
 
 
-def desk_of(assembly: Assembly) -> RunDesk:
+def service_of(assembly: Assembly) -> StandService:
     """Of a run of which only the stand is asked."""
     log, nothing = Logbook(assembly.hub, assembly.clock, fold((), ())), cast("Any", None)
-    return RunDesk(assembly, Path("session"), Stop(), log, nothing, nothing, nothing, nothing, nothing, nothing)
+    course = Course(assembly, Path("session"), Stop(), log, nothing, nothing, nothing)
+    return StandService(cast("Any", SimpleNamespace(assembly=assembly, guest=SimpleNamespace(course=course))))
 
 
-def paused(desk: RunDesk) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    done = desk.pause(Who(name="somebody", how="socket"))
+def paused(service: StandService) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    done = service.perform("pause", Who(name="somebody", how="socket"), PauseRequest())
+    assert isinstance(done, Done)
     return done.reasons, done.moving
 
 
 async def test_the_answer_to_a_pause_says_what_still_moves(order: Callable[..., Order], simulator: Start):
     async with bench_of(order(), simulator) as bench:
         stand = bench.assembly.stand
-        desk = desk_of(bench.assembly)
+        service = service_of(bench.assembly)
         tasks = [
             asyncio.create_task(stand.table.move_to("linear", 140)),
             asyncio.create_task(stand.imaging.open_flap()),
         ]
         await bench.wait(1)
-        assert paused(desk) == (("operator",), ("linear homing, then to 140 mm", "flap opening"))
+        assert paused(service) == (("operator",), ("linear homing, then to 140 mm", "flap opening"))
         await asyncio.gather(*tasks)
-        assert paused(desk) == (("operator",), ())
+        assert paused(service) == (("operator",), ())
         tasks = [asyncio.create_task(stand.table.move_to("linear", 1)), asyncio.create_task(stand.imaging.close_flap())]
         await bench.wait(1)
-        assert paused(desk) == (("operator",), ("linear to 1 mm", "flap closing"))
+        assert paused(service) == (("operator",), ("linear to 1 mm", "flap closing"))
         await asyncio.gather(*tasks)
 
 

@@ -16,8 +16,8 @@ from thermostand.foundation.errors import Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark
 from thermostand.recording.reading.session import Session
+from thermostand.stand.run import Interrupted, run_real
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.run import Interrupted, run_real
 from thermostand.stand.simulator import ControlSocket
 
 BRIEF = """

@@ -9,9 +9,9 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.recording.reading.run_word import Run
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.rehearsal import rehearsed
-from thermostand.stand.running.run import run_virtual
 
 RECIPE = "name: short\nsteps:\n  - start_chamber: 26\n  - soak: 300\n  - stop_chamber\n"
 

@@ -19,14 +19,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar
 
-from thermostand.foundation.clock import Clock, WallClock, utc_offset_ns
+from pydantic import BaseModel
+
+from thermostand.foundation.clock import WallClock, utc_offset_ns
+from thermostand.foundation.documents import Document
 from thermostand.foundation.events import COMMAND
-from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item, Original, StepMark
 from thermostand.foundation.readings import Frame
 from thermostand.foundation.tasks import failure_text
-from thermostand.stand.serving.desk import Desk, Done, PlanStep, StandState, Who, WrittenStep
-from thermostand.stand.serving.plan_faults import PlanCheck
+from thermostand.stand.serving.commands import STOP, Served
+from thermostand.stand.serving.desk import Done, PlanCheck, PlanStep, StandState, Who, WrittenStep
 
 _REFRESH_S = 0.5
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
@@ -64,11 +66,12 @@ class Bridge:
     The numbers of the stream go up from one daemon to the next, too: they begin at the time of its start.
     """
 
-    def __init__(self, desk: Desk, hub: Hub, clock: Clock) -> None:
+    def __init__(self, service: Served) -> None:
         self.failure = ""  # why there is no new snapshot
-        self._desk = desk
-        self._hub = hub
-        self._clock = clock
+        self.commands = service.commands
+        self._service = service
+        self._hub = service.hub
+        self._clock = service.clock
         self._loop = asyncio.get_running_loop()
         self._items: deque[tuple[int, int, Item]] = deque(maxlen=_QUEUE)
         self._seq = first_seq()
@@ -77,14 +80,14 @@ class Bridge:
         self._plan_at_s = 0.0
         self._tasks: set[asyncio.Task[None]] = set()
         self._stop_lock = threading.Lock()
-        self._stopping: concurrent.futures.Future[Done] | None = None
+        self._stopping: concurrent.futures.Future[BaseModel] | None = None
         self._stopped_s = -math.inf
         self._refreshing: asyncio.Future[None] | None = None
         self._next: asyncio.TimerHandle | None = None
         self._is_open = True
-        self.snapshot = Snapshot(desk.state(), time.monotonic())
+        self.snapshot = Snapshot(service.state(), time.monotonic())
         self._refresh()
-        hub.subscribe(self._follow)
+        self._hub.subscribe(self._follow)
 
     def close(self) -> None:
         """Nothing is followed any more, and orders are not taken."""
@@ -116,7 +119,7 @@ class Bridge:
         if not self._is_open:
             return
         try:
-            state = self._desk.state().model_copy(update={"seq": self._seq})
+            state = self._service.state().model_copy(update={"seq": self._seq})
             self.snapshot, self.failure = Snapshot(state, time.monotonic()), ""
         except Exception as error:  # noqa: BLE001 - clients see that it is old; the run does not depend on them
             self.failure = failure_text(error)
@@ -133,41 +136,44 @@ class Bridge:
                 taken.append(self._items.popleft())
         return taken
 
-    async def ask(self, call: Callable[[Desk], Result | Awaitable[Result]], limit_s: float = COMMAND_LIMIT_S) -> Result:
+    async def ask(
+        self, call: Callable[[Served], Result | Awaitable[Result]], limit_s: float = COMMAND_LIMIT_S
+    ) -> Result:
         """What `call` gives on the control loop, or what it raises. NoAnswer when that takes longer than `limit_s`:
         it may still be done."""
         answer: concurrent.futures.Future[Result] = concurrent.futures.Future()
         self._hand_over(lambda: self._called(call, answer))
         return await _within(limit_s, asyncio.wrap_future(answer))
 
-    async def command(self, call: Callable[[Desk], Done | Awaitable[Done]]) -> Done:
-        """As `ask`, with the number of the command's event."""
-        return await self.ask(self._numbered(call))
+    async def perform(self, name: str, who: Who, given: Document | None = None) -> BaseModel:
+        """Do a command, as `ask`; Done has the number of its event."""
+        return await self.ask(self._numbered(name, who, given))
 
-    def _numbered(self, call: Callable[[Desk], Done | Awaitable[Done]]) -> Callable[[Desk], Awaitable[Done]]:
-        async def numbered(desk: Desk) -> Done:
+    def _numbered(self, name: str, who: Who, given: Document | None) -> Callable[[Served], Awaitable[BaseModel]]:
+        async def numbered(service: Served) -> BaseModel:
             before = self._command_seq
-            done = call(desk)
-            done = await done if inspect.isawaitable(done) else done
+            came = service.perform(name, who, given)
+            came = await came if inspect.isawaitable(came) else came
             self._refresh_within(0.0)
-            return done.model_copy(update={"seq": self._command_seq}) if self._command_seq > before else done
+            is_numbered = isinstance(came, Done) and self._command_seq > before
+            return came.model_copy(update={"seq": self._command_seq}) if is_numbered else came
 
         return numbered
 
-    def stopping(self, who: Who) -> concurrent.futures.Future[Done]:
+    def stopping(self, who: Who) -> concurrent.futures.Future[BaseModel]:
         """The stop that is on its way, begun if there is none; from any thread. One that follows another within 0.1 s
         is done when these are over, with all that came until then. It ends as `ask`, but without a limit, and is not
         to be cancelled: a thousand who stop share it."""
         with self._stop_lock:
             if self._stopping is None or self._stopping.done():
-                stopping = self._stopping = concurrent.futures.Future[Done]()
+                stopping = self._stopping = concurrent.futures.Future[BaseModel]()
                 try:
                     self._hand_over(lambda: self._begin_stop(who, stopping))
                 except NoAnswer as error:
                     stopping.set_exception(error)
             return self._stopping
 
-    async def stop(self, who: Who) -> Done:
+    async def stop(self, who: Who) -> BaseModel:
         """Stop, as `stopping`. NoAnswer as `ask`."""
         stopping = asyncio.wrap_future(self.stopping(who))
         stopping.add_done_callback(lambda each: each.cancelled() or each.exception())  # others have it, too
@@ -187,12 +193,12 @@ class Bridge:
         plan = self._plan
         if plan is None or time.monotonic() > self._plan_at_s + _PLAN_AGE_S:
             self._plan_at_s = time.monotonic()
-            plan = self._plan = await asyncio.to_thread(self._desk.plan)
+            plan = self._plan = await asyncio.to_thread(self._service.plan)
         return plan
 
     async def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
         """What an edit of the plan would say; in a thread of its own, as `plan`."""
-        return await asyncio.to_thread(self._desk.check_edit, from_index, steps)
+        return await asyncio.to_thread(self._service.check_edit, from_index, steps)
 
     def _has_refreshed(self, refreshing: asyncio.Future[None]) -> None:
         self._refreshing = None
@@ -205,23 +211,23 @@ class Bridge:
         except RuntimeError:  # it is closed
             raise NoAnswer("the daemon has ended") from None
 
-    def _begin_stop(self, who: Who, stopping: concurrent.futures.Future[Done]) -> None:
+    def _begin_stop(self, who: Who, stopping: concurrent.futures.Future[BaseModel]) -> None:
         """On the control loop."""
         if (wait_s := self._stopped_s + _STOPPED_S - time.monotonic()) > 0.0:
             self._loop.call_later(wait_s, self._begin_stop, who, stopping)
             return
         self._stopped_s = time.monotonic()
-        self._called(self._numbered(lambda desk: desk.stop(who)), stopping)
+        self._called(self._numbered(STOP, who, None), stopping)
 
     def _called(
-        self, call: Callable[[Desk], Result | Awaitable[Result]], answer: concurrent.futures.Future[Result]
+        self, call: Callable[[Served], Result | Awaitable[Result]], answer: concurrent.futures.Future[Result]
     ) -> None:
         """On the control loop."""
         if not self._is_open:
             answer.set_exception(NoAnswer("the daemon is ending"))
             return
         try:
-            result = call(self._desk)
+            result = call(self._service)
         except Exception as error:  # noqa: BLE001 - it belongs to who asked
             _give(answer, error)
             return

@@ -26,7 +26,7 @@ from thermostand.stand.serving.api.bridge import Bridge
 from thermostand.stand.serving.api.doors import Interface, OtherDoor
 from thermostand.stand.serving.api.pace import Pace
 from thermostand.stand.serving.api.stop_thread import StopThread
-from thermostand.stand.serving.desk import Desk
+from thermostand.stand.serving.commands import Served
 from thermostand.stand.serving.presence import Entry, Presence
 
 _LOOK_S = 1.0
@@ -36,13 +36,7 @@ _READY_LIMIT_S = 30.0
 
 @asynccontextmanager
 async def serve(
-    desk: Desk,
-    hub: Hub,
-    clock: Clock,
-    session: Path,
-    stand: str,
-    interface: Interface,
-    patience: Patience | None = None,
+    service: Served, session: Path, stand: str, interface: Interface, patience: Patience | None = None
 ) -> AsyncGenerator[Presence]:
     """Answer for the daemon that runs `session` on the stand of this name while inside; at the end for as long as
     `patience` lasts.
@@ -50,6 +44,7 @@ async def serve(
     SessionError when the runtime folder cannot be used, ConfigError when it cannot listen at the port. A socket or
     entry that somebody removes is made again within some seconds.
     """
+    hub, clock = service.hub, service.clock
     interface.check()
     presence = Presence(Entry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
     report, patience = _reporter(hub, clock), patience or Patience()
@@ -57,7 +52,7 @@ async def serve(
     doors = {"socket": everything, "stop": stopping}
     try:
         doors.update(_tcp_doors(interface))
-        bridge = Bridge(desk, hub, clock)
+        bridge = Bridge(service)
         access = Access(interface.tokens, interface.hosts, interface.trusts_loopback)
         stop = StopThread(bridge.stopping, access, lambda error: report(INTERFACE_FAILED, _failure(error)))
     except BaseException:

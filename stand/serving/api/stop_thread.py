@@ -20,6 +20,7 @@ from contextlib import suppress
 from typing import Literal
 
 import h11
+from pydantic import BaseModel
 
 from thermostand.stand.serving.api.access import (
     FAILED,
@@ -33,10 +34,10 @@ from thermostand.stand.serving.api.access import (
 )
 from thermostand.stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, no_answer
 from thermostand.stand.serving.api.pace import Pace
-from thermostand.stand.serving.desk import Done, Who
+from thermostand.stand.serving.desk import Who
 
 Door = Literal["stop", "tcp"]
-Stopping = Callable[[Who], "concurrent.futures.Future[Done]"]
+Stopping = Callable[[Who], "concurrent.futures.Future[BaseModel]"]
 
 _MOST_CLIENTS = 128  # of a door, before _AT_ONCE more are let in, who have not been answered or handed over
 _MOST_OTHERS = 64  # handed over, and not taken yet
@@ -135,7 +136,7 @@ class _Client:
         self.connection = connection
         self.came_s = now_s
         self.until_s = now_s + _ASK_WITHIN_S
-        self.answer: concurrent.futures.Future[Done] | None = None
+        self.answer: concurrent.futures.Future[BaseModel] | None = None
         self.has_spoken = False
         self.has_answer = False
 
@@ -384,7 +385,7 @@ class StopThread:
         client.connection.close()
 
 
-def _given(answer: concurrent.futures.Future[Done]) -> bytes:
+def _given(answer: concurrent.futures.Future[BaseModel]) -> bytes:
     error = answer.exception()
     if error is None:
         return last_answer(200, answer.result().model_dump_json().encode())

@@ -15,22 +15,34 @@ async function read(answer) {
   return body;
 }
 
-export async function send(method, path, body, headers = {}) {
+export async function send(method, path, body) {
   const answer = await fetch(BASE + path, {
     method,
-    headers: body === undefined ? headers : { "content-type": "application/json", ...headers },
+    headers: body === undefined ? {} : { "content-type": "application/json" },
     body: body === undefined ? undefined : JSON.stringify(body),
   });
   return read(answer);
 }
 
-// `place` gets the outcome; returns the answer, or null when it was refused.
-export async function command(place, text, method, path, body, headers) {
-  tell(place, `${text} …`);
+// What may be ordered, by name: where, and what it is called.
+let table = null;
+const STOP = { method: "POST", path: `${BASE}/run/stop` }; // which waits for no table
+async function commands() { return (table ??= new Map((await get("/commands")).map((each) => [each.name, each]))); }
+
+// Orders the command of that name with what its argument takes; `said`: what it is called here. `place` gets the
+// outcome; returns the answer, or null when it was refused.
+export async function order(place, name, given = {}, said = name) {
+  tell(place, `${said} …`);
   try {
-    const answer = await send(method, path, body, headers);
+    const { method, path } = name === "stop" ? STOP : (await commands()).get(name), body = { ...given };
+    const at = path.slice(BASE.length).replace(/{(\w+)}/g, (_, field) => {
+      const value = body[field];
+      delete body[field];
+      return encodeURIComponent(value);
+    });
+    const answer = await send(method, at, Object.keys(body).length ? body : undefined);
     const moving = answer.moving?.length ? `; still moving: ${answer.moving.join(", ")}` : "";
-    tell(place, (answer.text || `${text}: done`) + moving);
+    tell(place, (answer.text || `${said}: done`) + moving);
     return answer;
   } catch (error) {
     tell(place, error instanceof Refused ? error.message : `the stand could not be reached (${error.message})`, true);

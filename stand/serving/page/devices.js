@@ -1,5 +1,5 @@
 // Devices by hand, through the same gate as a run; while a run owns the stand they take no orders.
-import { command, get, tell } from "./api.js";
+import { get, order, tell } from "./api.js";
 import { look_of } from "./channels.js";
 import { fill, h, number, say, unit_of, words } from "./dom.js";
 import { Faults } from "./faults.js";
@@ -49,7 +49,7 @@ export class Devices {
     return h("form", { class: "row", "data-verb": verb.verb, onsubmit: (event) => {
       event.preventDefault();
       const given = Object.fromEntries(inputs.map(({ name, value }) => [name, value()]).filter(([, value]) => value !== undefined));
-      command(answer, verb.text || words(verb.verb), "POST", `/devices/${encodeURIComponent(device.name)}/${encodeURIComponent(verb.verb)}`, { arguments: given });
+      order(answer, "device", { device: device.name, verb: verb.verb, arguments: given }, verb.text || words(verb.verb));
     } }, inputs.map(({ label }) => label), h("button", { type: "submit", "data-order": "" }, verb.text || words(verb.verb)));
   }
 

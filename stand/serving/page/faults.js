@@ -1,5 +1,5 @@
 // Faults on purpose, in the simulated laboratory only: what can be broken, what is, and mending it.
-import { command, get, tell } from "./api.js";
+import { get, order, tell } from "./api.js";
 import { fill, h, say, words } from "./dom.js";
 
 export class Faults {
@@ -45,7 +45,7 @@ export class Faults {
   }
 
   async order(text, body) {
-    await command(this.answer, text, "POST", "/simulator/faults", body);
+    await order(this.answer, "fault", body, text);
     this.load();
   }
 }

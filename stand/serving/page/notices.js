@@ -1,5 +1,5 @@
 // What needs somebody: a fault, a prompt, a pause, a connection that is lost. Below the header, never over STOP.
-import { command } from "./api.js";
+import { order } from "./api.js";
 import { temperatures, look_of } from "./channels.js";
 import { clock, day_clock, fill, h, number, say, seconds, unit_of, words } from "./dom.js";
 
@@ -78,7 +78,7 @@ export class Notices {
     const answer = h("p", { class: "answer", role: "status" });
     const review = h("div", { hidden: true });
     const readings = h("dl", { class: "facts" });
-    const clear = h("button", { type: "button", class: "main", "data-order": "", onclick: () => command(answer, "clear", "POST", "/run/clear") }, "The cause is removed: clear");
+    const clear = h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "clear") }, "The cause is removed: clear");
     const open = h("button", { type: "button", "aria-expanded": "false", onclick: () => {
       review.hidden = !review.hidden;
       open.setAttribute("aria-expanded", String(!review.hidden));
@@ -109,7 +109,7 @@ export class Notices {
   prompt({ text }) {
     const answer = h("p", { class: "answer", role: "status" });
     const element = h("section", { class: "notice warning", role: "alert" }, h("h2", {}, "The run waits for you"), h("p", {}, text),
-      h("div", { class: "row" }, h("button", { type: "button", class: "main", "data-order": "", onclick: () => command(answer, "continue", "POST", "/run/continue") }, "Done, go on")), answer);
+      h("div", { class: "row" }, h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "continue") }, "Done, go on")), answer);
     return { element };
   }
 
@@ -136,14 +136,14 @@ export class Notices {
 
   halted(state) {
     const answer = h("p", { class: "answer", role: "status" });
-    const button = h("button", { type: "button", "data-order": "", onclick: () => command(answer, "go on", "POST", "/run/clear") }, "Go on with the queue");
+    const button = h("button", { type: "button", "data-order": "", onclick: () => order(answer, "clear", {}, "go on") }, "Go on with the queue");
     return { element: h("section", { class: "notice warning" }, h("h2", {}, "The queue is halted"), h("p", {}, state.queue_halted), h("div", { class: "row" }, button), answer) };
   }
 
   held(state) {
     const answer = h("p", { class: "answer", role: "status" });
     const is_mine = state.reasons.includes("operator");
-    const button = h("button", { type: "button", class: "main", "data-order": "", onclick: () => command(answer, "continue", "POST", "/run/continue") }, "Continue");
+    const button = h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "continue") }, "Continue");
     const text = h("p", {});
     const element = h("section", { class: "notice warning" }, h("h2", {}, `The run is held: ${state.reasons.map(reason).join("; ")}`),
       text, is_mine ? h("div", { class: "row" }, button) : null, answer);

@@ -1,5 +1,5 @@
 // The plan as a time line and as a list: what is done, what is earned, what is to come and when.
-import { command, get, tell } from "./api.js";
+import { get, order, tell } from "./api.js";
 import { ask, axes_of, clock, css, day_clock, duration, fill, h, number, say, seconds } from "./dom.js";
 import { PlanEdit, step_schema } from "./plan_edit.js";
 
@@ -36,7 +36,7 @@ export class Plan {
   }
 
   async order(verb, body, text) {
-    await command(this.answer, text, "POST", `/run/${verb}`, body);
+    await order(this.answer, verb, body, text);
     this.refresh();
   }
 

@@ -1,6 +1,6 @@
 // The steps to come as rows that are changed, moved, duplicated, removed and added. The stand checks all of them after each
 // change, and what is wrong stands in the row that it is about; nothing is replaced before nothing is wrong.
-import { command, get, send, tell } from "./api.js";
+import { get, order, send, tell } from "./api.js";
 import { duration, fill, h, words } from "./dom.js";
 import { RecipeForm, collect, set_fixed } from "./recipe_form.js";
 
@@ -171,7 +171,7 @@ export class PlanEdit {
   async replace() {
     if (!(await this.check())) return this.list.querySelector("[data-wrong] :is(input, select, textarea, button)")?.focus();
     const steps = this.steps();
-    if (steps && await command(this.answer, "edit the plan", "PUT", "/run/plan", { from_index: this.from_index, steps })) this.close();
+    if (steps && await order(this.answer, "edit", { from_index: this.from_index, steps }, "edit the plan")) this.close();
   }
 
   // The plan as it is now: a step that has begun meanwhile is no longer to come.

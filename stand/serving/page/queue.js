@@ -1,5 +1,5 @@
 // The queue of runs, and the form that adds one.
-import { command, get, tell } from "./api.js";
+import { get, order, tell } from "./api.js";
 import { ask, axes_of, day_clock, duration, fill, h, hold_resumes, seconds } from "./dom.js";
 import { RecipeForm } from "./recipe_form.js";
 
@@ -68,20 +68,20 @@ export class Queue {
   }
 
   async submit() {
-    let order;
+    let wanted;
     try {
       const recipe = JSON.stringify(this.form.recipe());
-      order = recipe === this.unchanged ? { recipe: this.installed } : { recipe_text: recipe };
+      wanted = recipe === this.unchanged ? { recipe: this.installed } : { recipe_text: recipe };
     } catch (error) { return tell(this.form_answer, error.message, true); }
-    order.attended = this.attended.checked;
+    wanted.attended = this.attended.checked;
     const tags = this.tags.value.split(/[\s,;]+/).filter(Boolean);
-    if (tags.length) order.tags = tags;
-    if (this.note.value) order.note = this.note.value;
-    const body = JSON.stringify(order);
+    if (tags.length) wanted.tags = tags;
+    if (this.note.value) wanted.note = this.note.value;
+    const body = JSON.stringify(wanted);
     // The same key until something is changed or the stand has answered: pressed twice, it is one run.
     if (body !== this.sent) { this.sent = body; this.key = `page-${Date.now()}-${Math.random().toString(36).slice(2)}`; }
     this.start.disabled = true;
-    const run = await command(this.form_answer, "checking wires, disk and limits", "POST", "/queue", order, { "idempotency-key": this.key });
+    const run = await order(this.form_answer, "submit", { ...wanted, key: this.key }, "checking wires, disk and limits");
     this.start.disabled = false;
     if (run) {
       this.sent = null;
@@ -117,10 +117,10 @@ export class Queue {
     if (at >= 0) {
       button("▲", "Earlier", () => this.move(run, at), at === 0);
       button("▼", "Later", () => this.move(run, at + 2), at === movable.length - 1);
-      button("Remove", "Remove", () => ask(row, `Take run ${run.id} (${run.recipe}) out of the queue?`, "Remove it", () => command(this.answer, "remove", "DELETE", `/queue/${run.id}`)));
+      button("Remove", "Remove", () => ask(row, `Take run ${run.id} (${run.recipe}) out of the queue?`, "Remove it", () => order(this.answer, "cancel", { run: run.id }, "remove")));
       this.drag(row, run, at);
     }
-    if (RESUMABLE.includes(run.state) && run.session) button("Resume", "Resume", () => command(this.answer, "resume", "POST", `/sessions/${encodeURIComponent(run.session)}/resume`));
+    if (RESUMABLE.includes(run.state) && run.session) button("Resume", "Resume", () => order(this.answer, "resume", { session: run.session }));
     return row;
   }
 
@@ -138,7 +138,7 @@ export class Queue {
     });
   }
 
-  move(run, to) { command(this.answer, `move run ${run.id}`, "POST", `/queue/${run.id}/move`, { to }); }
+  move(run, to) { order(this.answer, "move", { run: run.id, to }, `move run ${run.id}`); }
   // A list that the stand could not give when the view was opened.
   soon() { if (!this.form) { tell(this.form_answer, ""); this.load(); } }
   event() {}

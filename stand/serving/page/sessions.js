@@ -1,5 +1,5 @@
 // Recorded sessions, their reports, and two nights one over the other.
-import { command, get, tell } from "./api.js";
+import { get, order, tell } from "./api.js";
 import { look_of } from "./channels.js";
 import { swatch } from "./now.js";
 import { bytes, css, dated_clock, duration, fill, h, hold_resumes, seconds } from "./dom.js";
@@ -55,7 +55,7 @@ export class Sessions {
     const took = each.begin_ns && each.end_ns ? duration((each.end_ns - each.begin_ns) / 1e9) : "–";
     const path = encodeURIComponent(each.name), actions = h("span", { class: "row" });
     if (each.has_report) actions.append(h("a", { href: `/api/v1/sessions/${path}/report.html`, target: "_blank", rel: "noopener" }, "report"));
-    if (RESUMABLE.includes(each.run)) actions.append(h("button", { type: "button", class: "small", "data-order": "", "data-resume": "", "aria-label": `Resume ${each.name}`, onclick: () => command(this.answer, `resume ${each.name}`, "POST", `/sessions/${path}/resume`) }, "Resume"));
+    if (RESUMABLE.includes(each.run)) actions.append(h("button", { type: "button", class: "small", "data-order": "", "data-resume": "", "aria-label": `Resume ${each.name}`, onclick: () => order(this.answer, "resume", { session: each.name }, `resume ${each.name}`) }, "Resume"));
     actions.append(h("button", { type: "button", class: "small", "data-order": "", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
     const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
     return h("tr", {}, h("td", {}, box),
@@ -71,7 +71,7 @@ export class Sessions {
     const input = h("input", { type: "text", maxlength: 4000, "aria-label": `Note on ${each.name}`, size: 30 });
     const form = h("form", { class: "row", onsubmit: async (event) => {
       event.preventDefault();
-      if (await command(this.answer, "note", "POST", `/sessions/${encodeURIComponent(each.name)}/notes`, { text: input.value })) { form.remove(); this.load(); }
+      if (await order(this.answer, "note", { session: each.name, text: input.value })) { form.remove(); this.load(); }
     } }, input, h("button", { type: "submit", class: "small", "data-order": "" }, "Keep"));
     place.append(form);
     input.focus();

@@ -53,7 +53,7 @@ def command(argument: DataInfo | None = None, result: DataInfo | None = None) ->
 def taken(info: DataInfo, value: JsonValue) -> JsonValue:
     """The value, when it is of that type; Refusal WrongType or RangeError. An enum takes its names, too."""
     match info["type"]:
-        case "double":
+        case "double" | "int":
             return _number(info, value)
         case "string":
             return _string(value)
@@ -75,7 +75,9 @@ def _number(info: DataInfo, value: JsonValue) -> float:
         raise Refusal("RangeError", f"at least {low:g}, not {number:g}")
     if not math.isfinite(number) or (isinstance(high, int | float) and number > high):
         raise Refusal("RangeError", f"at most {high:g}, not {number:g}" if high is not None else "too large")
-    return number
+    if info["type"] == "int" and not number.is_integer():
+        raise Refusal("WrongType", "a whole number is needed")
+    return int(number) if info["type"] == "int" else number
 
 
 def _string(value: JsonValue) -> str:

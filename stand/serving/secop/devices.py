@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pydantic import JsonValue
 
 from thermostand.stand.estimating.chamber_model import BAND_K
-from thermostand.stand.serving.desk import DeviceState, ReadingState, RunRequest, RunStatus, StandState
+from thermostand.stand.serving.commands import STOP
+from thermostand.stand.serving.commands import Command as Ordered
+from thermostand.stand.serving.desk import DeviceState, ReadingState, RunStatus, StandState
 from thermostand.stand.serving.secop import datainfo
 from thermostand.stand.serving.secop.modules import (
     BUSY,
@@ -31,14 +33,22 @@ from thermostand.stand.serving.secop.modules import (
 from thermostand.stand.serving.secop.secop_lines import Refusal
 
 CHAMBER, RUN = "chamber", "run"
+_NAMES = {STOP: "stop", "clear": "clear_errors"}  # that SECoP has itself; all others are our own
+_INFOS: dict[object, Callable[[], datainfo.DataInfo]] = {
+    str: datainfo.text,
+    int: datainfo.whole,
+    float: datainfo.double,
+}
 _CLOSED, _OPEN, _MOVING = 0, 1, 2
 _PHASES = {"idle": 0, "running": 1, "held": 2, "stopping": 3}
 
 
-def modules(devices: Iterable[DeviceState], readings: Mapping[str, ReadingState]) -> dict[str, Module]:
+def modules(
+    devices: Iterable[DeviceState], readings: Mapping[str, ReadingState], commands: Mapping[str, Ordered]
+) -> dict[str, Module]:
     """By name, in the order in which clients show them: the channel's with an underscore for a temperature."""
     found: dict[str, Module] = {}
-    for name, module in (*_of(devices, readings), (RUN, _run())):
+    for name, module in (*_of(devices, readings), (RUN, _run(commands))):
         while name in found:  # such as an axis that is called chamber
             name += "_"
         found[name] = module
@@ -183,7 +193,7 @@ def _axis(device: DeviceState, readings: Mapping[str, ReadingState]) -> Module:
     return Module(f"the stage {name}", "Drivable", "stages", parameters, commands, name, read_ns, is_read_after=True)
 
 
-def _run() -> Module:
+def _run(commands: Mapping[str, Ordered]) -> Module:
     def parameter(text: str, info: datainfo.DataInfo, read: Callable[[RunStatus], JsonValue], none: JsonValue):
         return Parameter(text, info, lambda s: Known(none if s.state.run is None else read(s.state.run)))
 
@@ -207,20 +217,8 @@ def _run() -> Module:
             "what has tripped", datainfo.text(), lambda s: Known("" if s.state.fault is None else s.state.fault.text)
         ),
     }
-    commands = {
-        "stop": Command(
-            "STOP: make the stand safe and end the run, in every state, at once",
-            lambda _: lambda desk, who: desk.stop(who),
-            is_stop=True,
-        ),
-        "clear_errors": Command("the cause of a trip has been removed", lambda _: lambda desk, who: desk.clear(who)),
-        "_pause": Command("hold the run before its next action", lambda _: lambda desk, who: desk.pause(who)),
-        "_continue": Command("end a pause", lambda _: lambda desk, who: desk.continue_(who)),
-        "_submit": Command(
-            "queue an installed recipe; gives its number in the queue", _submit, datainfo.text(), datainfo.whole()
-        ),
-    }
-    return Module("runs, and the stand as a whole", "Readable", RUN, parameters, commands)
+    ordered = {_NAMES.get(name, f"_{name}"): _command(each) for name, each in commands.items() if _is_offered(each)}
+    return Module("runs, and the stand as a whole", "Readable", RUN, parameters, ordered)
 
 
 def _run_status(seen: Seen) -> tuple[int, str]:
@@ -235,8 +233,25 @@ def _run_status(seen: Seen) -> tuple[int, str]:
     return (IDLE, "") if state.phase == "idle" else (BUSY, "a run is under way" if state.run is None else "")
 
 
-def _submit(recipe: JsonValue) -> Order:
-    return lambda desk, who: desk.submit(who, RunRequest(recipe=str(recipe)))
+def _is_offered(command: Ordered) -> bool:
+    field = command.secop_field
+    return field is not None and (not field or _type_of(command, field) in _INFOS)
+
+
+def _type_of(command: Ordered, field: str) -> object:
+    return None if command.argument is None else command.argument.model_fields[field].annotation
+
+
+def _command(command: Ordered) -> Command:
+    """A command of the stand's service, with at most one field of its argument; what it queues has a number."""
+    field = command.secop_field
+
+    def order(value: JsonValue) -> Order:
+        return Order(command.name, {field: value} if field else {})
+
+    argument = _INFOS[_type_of(command, field)]() if field else None
+    result = datainfo.whole() if "id" in command.answer.model_fields else None
+    return Command(command.summary, order, argument, result, is_stop=command.name == STOP)
 
 
 def _range(device: DeviceState, verb: str) -> tuple[float | None, float | None]:

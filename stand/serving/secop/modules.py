@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import JsonValue
 
-from thermostand.stand.serving.desk import Desk, Done, QueuedRun, ReadingState, StandState, Who
+from thermostand.stand.serving.desk import ReadingState, StandState
 from thermostand.stand.serving.secop import datainfo
 from thermostand.stand.serving.secop.datainfo import DataInfo
 from thermostand.stand.serving.secop.secop_lines import Refusal
@@ -82,8 +82,11 @@ class Seen:
         return Known(reading.value, reading.time_ns)
 
 
-# What is done on the control loop.
-Order = Callable[[Desk, Who], Awaitable[Done | QueuedRun] | Done]
+class Order(NamedTuple):
+    """A command of the stand's service, and the fields of its argument."""
+
+    command: str
+    fields: Mapping[str, JsonValue]
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,4 +194,4 @@ def driven(seen: Seen, channel: str, read_ns: int) -> tuple[int, str]:
 
 def by_hand(device: str, verb: str, **arguments: JsonValue) -> Order:
     """An order to a device, through the gate of all that is done by hand."""
-    return lambda desk, who: desk.device(who, device, verb, arguments)
+    return Order("device", {"device": device, "verb": verb, "arguments": arguments})

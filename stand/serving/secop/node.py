@@ -7,10 +7,10 @@ is an event of the recording. Nothing here is called by the control loop.
 from __future__ import annotations
 
 import re
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from pydantic import JsonValue
+from pydantic import BaseModel, JsonValue, ValidationError
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import (
@@ -23,7 +23,7 @@ from thermostand.foundation.errors import (
     Unreachable,
 )
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, Snapshot
-from thermostand.stand.serving.desk import Conflict, Desk, DeviceState, Done, QueuedRun, StandState, Who
+from thermostand.stand.serving.desk import Conflict, DeviceState, QueuedRun, StandState, Who
 from thermostand.stand.serving.secop.datainfo import taken
 from thermostand.stand.serving.secop.devices import modules
 from thermostand.stand.serving.secop.modules import Command, Drive, Known, Module, Order, Report, Seen
@@ -71,7 +71,7 @@ class Node:
         read_only: bool = False,
     ) -> None:
         state = bridge.snapshot.state
-        found = modules(devices, state.readings)
+        found = modules(devices, state.readings, bridge.commands)
         self.modules: dict[str, Module] = {n: each.looked_at() for n, each in found.items()} if read_only else found
         self._read_only = read_only
         self.description = message("describing", ".", _description(state, self.modules))
@@ -174,16 +174,17 @@ class Node:
             raise Refusal("WrongType", "this command takes no argument")
         return None
 
-    async def _ordered(self, order: Order, name: str, target: JsonValue) -> Done | QueuedRun:
+    async def _ordered(self, order: Order, name: str, target: JsonValue) -> BaseModel:
         """What came of it; what it changes at once has been sent when this returns."""
 
         module, began_ns = self.modules[name], self._bridge.snapshot.state.now_ns
 
-        def call(desk: Desk) -> Awaitable[Done | QueuedRun] | Done:
-            return order(desk, WHO)
-
+        argument = self._bridge.commands[order.command].argument
         try:
-            came: Done | QueuedRun = await self._bridge.ask(call)
+            given = None if argument is None else argument.model_validate(order.fields)
+            came = await self._bridge.perform(order.command, WHO, given)
+        except ValidationError as error:
+            raise Refusal("RangeError", error.errors()[0]["msg"]) from error
         except (StandError, NoAnswer) as error:
             raise _refusal(error, (await self._bridge.fresh()).state) from error
         except Exception as error:

@@ -1,4 +1,4 @@
-"""The queue of a daemon: what may be queued, what is in it, and how one of it is run on the open stand.
+"""The queue of a daemon: what may be queued, and what is in it.
 
 A night is checked when it is queued: recipe, limits, devices that answer, room on the disk. All that
 touches the disk is done in a thread of its own, which keeps no daemon from leaving.
@@ -6,38 +6,29 @@ touches the disk is done in a thread of its own, which keeps no daemon from leav
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import importlib.resources
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from thermostand.experiments.steps import Capture
 from thermostand.foundation.calls import Lane
-from thermostand.foundation.errors import ConfigError, Interrupted, SessionError, StandError
-from thermostand.foundation.hub import Hub
+from thermostand.foundation.errors import ConfigError, SessionError, StandError
 from thermostand.foundation.readings import Quality
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, Disk, DiskCalls
 from thermostand.stand.config.checked import ATTACHMENT
-from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.estimating.learned import learn
 from thermostand.stand.estimating.run_estimate import Night, price_night, small_disk
 from thermostand.stand.queueing import queue
-from thermostand.stand.queueing.queue import Asked, order_of
+from thermostand.stand.queueing.queue import Asked
 from thermostand.stand.queueing.queue_file import Entry, Queue, State, worked_on
-from thermostand.stand.queueing.queue_run import Watch, interruption_of, is_complete
-from thermostand.stand.queueing.queue_work import Halt, Notes, Stopped
-from thermostand.stand.running.executing.settling_watch import load_for
-from thermostand.stand.running.guest import Job
+from thermostand.stand.queueing.queue_work import is_complete
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import Order, attached_optics, check_plan, parse_order
-from thermostand.stand.running.resume import Interruption, repaired
-from thermostand.stand.running.run import run_in
-from thermostand.stand.running.said import Said, keep
+from thermostand.stand.running.resume import repaired
+from thermostand.stand.running.said import Said
 from thermostand.stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended
@@ -57,7 +48,6 @@ class Orders:
         directory: Path,
         config_name: str,
         texts: dict[str, str],
-        recorded: Callable[[Path], None] | None = None,
     ) -> None:
         self.queued = Queue()
         self.stop: Stop | None = None
@@ -71,7 +61,6 @@ class Orders:
         self._open_stand = open_stand
         self._config_name = config_name
         self._texts = texts
-        self._recorded_whole = recorded
         self._expected_s: dict[int, float] = {}
 
     async def read(self) -> None:
@@ -97,7 +86,7 @@ class Orders:
     async def submit(self, who: Who, request: RunRequest, key: str) -> Entry:
         """ConfigError for what is wrong with the request, Conflict for what is wrong with the stand."""
         order = await self.reading.call(self._order, request)
-        _said(who, request.note, request.tags)
+        said_of(who, request.note, request.tags)
         night = await self.reading.call(self._night, order)
         self._check_wires(order)
         digest = hashlib.sha256(request.model_dump_json().encode()).hexdigest()[:16]
@@ -145,64 +134,6 @@ class Orders:
         await self.read()
         return entry
 
-    async def run_one(self, entry: Entry, notes: Notes, begun: Callable[[], None], tell: Callable[[str], None]) -> Path:
-        """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
-        without the record between runs. Raises as a run does, Stopped when an operator has stopped it: who presses
-        stop does not want the next one to begin."""
-        session = self.directory / entry.session if entry.session else None
-        if session is not None and await self.repair.call(is_complete, session):
-            return session  # killed between its end and the note of it
-        order = await self.reading.call(self._order_of, entry)
-        config = order.config
-        before = None if session is None else await self._interruption(session, config)
-        watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
-        hub = self._open_stand.assembly.hub
-
-        async def recorded(folder: Path) -> None:
-            await notes.begun(folder)
-            begun()
-            if session is None and (said := _said(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
-                try:
-                    await keep(said, folder, hub, self._open_stand.assembly.clock, self.notes)
-                except SessionError as error:
-                    tell(f"warning: {error}")
-
-        def follow(hub: Hub) -> None:
-            hub.subscribe(watch)
-
-        plan = tuple(order.recipe.plan())
-        await asyncio.to_thread(load_for, plan)
-        job = Job(order, self.directory, None, follow, recorded, before)
-        try:
-            async with Stop(has_signals=False) as self.stop:
-                done = await run_in(self._open_stand, job, self.stop)
-        except Interrupted as error:
-            if self.leaving:
-                raise
-            follows = any(each.is_open for each in self.queued.entries)
-            clear = "; the next of the queue begins when the stand is cleared" if follows else ""
-            raise Stopped(f"{error}; it may be resumed{clear}", halts=follows) from error
-        finally:
-            self.stop = None
-            hub.unsubscribe(watch)
-        try:
-            await self.repair.call(learn, self.directory, config)
-        except SessionError as error:
-            tell(f"warning: what this run has taught of durations is not kept: {error}")
-        if self._recorded_whole is not None and any(isinstance(planned.step, Capture) for planned in plan):
-            self._recorded_whole(done)
-        return done
-
-    async def _interruption(self, session: Path, config: StandConfig) -> Interruption:
-        """What is left of its run; Halt when it cannot be resumed. What has to be written for that is written by the
-        disk's process."""
-        try:
-            salvaged = await self.repair.call(repaired, session)
-        except SessionError as error:
-            raise Halt(str(error)) from error
-        before = await self.reading.call(partial(interruption_of, session, config, clear=True))
-        return replace(before, salvaged=(*salvaged, *before.salvaged))
-
     def shown(self) -> tuple[QueuedRun, ...]:
         """The queue for clients: the last that have ended, the run under way, those to be done."""
         ended = [entry for entry in self.queued.entries if not entry.is_open and entry.state is not State.RUNNING]
@@ -241,8 +172,9 @@ class Orders:
         order = replace(parse_order({**self._texts, "recipe.yaml": text}, names), attended=request.attended)
         return self._here(order)
 
-    def _order_of(self, entry: Entry) -> Order:
-        return self._here(replace(order_of(entry), attended=entry.attended))
+    def order_of(self, entry: Entry) -> Order:
+        """What it asks for, on the stand as it is open now; ConfigError as `queue.order_of`."""
+        return self._here(replace(queue.order_of(entry), attended=entry.attended))
 
     def _here(self, order: Order) -> Order:
         """The same on the stand as it is open now."""
@@ -297,8 +229,8 @@ class Orders:
             raise Conflict(f"this stand cannot run it now: {'; '.join(lacks)}")
 
 
-def _said(who: Who, note: str, tags: Sequence[str]) -> Said | None:
-    """ConfigError for what is no tag."""
+def said_of(who: Who, note: str, tags: Sequence[str]) -> Said | None:
+    """A note and tags, None without either; ConfigError for what is no tag."""
     return Said(who, note, tags) if note.strip() or tags else None
 
 

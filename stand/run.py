@@ -11,7 +11,14 @@ from pathlib import Path
 
 from thermostand.foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
 from thermostand.foundation.errors import Interrupted, SessionError, StandError, StandTripped
-from thermostand.foundation.events import JOURNAL_DAMAGED, LIMITS_ACCEPTED, NOTIFY_FAILED, SALVAGED, STAND_DIFFERS
+from thermostand.foundation.events import (
+    JOURNAL_DAMAGED,
+    LIMITS_ACCEPTED,
+    NO_CONTROL,
+    NOTIFY_FAILED,
+    SALVAGED,
+    STAND_DIFFERS,
+)
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.instants import utc_text
 from thermostand.foundation.items import Event, Item
@@ -43,7 +50,10 @@ from thermostand.stand.running.session_files import (
     session_directory,
     tell_identities,
 )
+from thermostand.stand.service import StandService
 from thermostand.stand.serving.alerts import alerting
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.server import serve
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
 
 __all__ = ["Interrupted", "resume", "run_in", "run_real", "run_virtual"]
@@ -278,8 +288,20 @@ async def _stay(
         recorder = await open_stand.or_safe(_recording(job, directory, open_stand.assembly, early, disk), stop)
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording, stop)
-        await Guest(job, open_stand, recorder, stop).run(recording)
+        answer = partial(_answer, open_stand, directory) if open_stand.is_for_one else None
+        await Guest(job, open_stand, recorder, stop, answer).run(recording)
     return recorder
+
+
+async def _answer(open_stand: OpenStand, directory: Path) -> None:
+    """Answer clients of a run by itself until cancelled; it can do without any."""
+    service, assembly = StandService(open_stand), open_stand.assembly
+    try:
+        async with serve(service, directory, assembly.config.name, Interface(directory.parent), service.patience):
+            await asyncio.Event().wait()
+    except StandError as error:
+        assembly.hub.publish(NO_CONTROL.at(assembly.clock.now_ns(), f"the run cannot be queried or paused: {error}"))
+        await asyncio.Event().wait()
 
 
 async def _with_camera(assembly: Assembly) -> None:

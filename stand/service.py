@@ -1,0 +1,433 @@
+"""What can be asked of a stand: its one service, for a run in its own process and for a daemon.
+
+Each command is a method here and nothing else (stand/serving/commands.py says what follows from it). What it does to
+the page is the page's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Coroutine, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Protocol, cast
+
+from pydantic import ConfigDict, Field, JsonValue
+
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.recording.reading.notes import LONGEST_NOTE
+from thermostand.stand.gate import ENDINGS, INTERLOCK, OPERATOR, Phase
+from thermostand.stand.serving.commands import Served, Typed, command
+from thermostand.stand.serving.desk import (
+    Conflict,
+    DeviceState,
+    Done,
+    FaultRequest,
+    FaultState,
+    Missing,
+    PlanCheck,
+    PlanRequest,
+    PlanStep,
+    QueuedRun,
+    RunRequest,
+    SimulatedFaults,
+    StandState,
+    Tag,
+    When,
+    Who,
+    WrittenStep,
+    seen_state,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from thermostand.foundation.patience import Patience
+    from thermostand.recording.writing.disk import DiskCalls
+    from thermostand.stand.queueing.orders import Orders
+    from thermostand.stand.running.course import Course
+    from thermostand.stand.running.guest import Guest
+    from thermostand.stand.running.opening.open_stand import OpenStand
+
+_NOTHING_RUNS = "nothing is run now"
+_NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"
+_ENDING = (Phase.ABORTING, Phase.ENDING, Phase.ENDED)
+
+RunNumber = Annotated[int, Field(ge=1, le=1 << 53)]
+SessionName = Annotated[str, Field(max_length=255)]
+StepId = Annotated[str, Typed("step", help="Its number in `stand status --plan`, or its id."), Field(max_length=200)]
+
+
+class PauseRequest(Document):
+    """now: before the next action; step: when the step under way is done."""
+
+    when: Annotated[
+        When, Typed("at_next_step", value="step", help="When the step under way is done, not before the next action.")
+    ] = "now"
+
+
+class SkipRequest(Document):
+    """The step that is left out or broken off: its id, or its number in the plan from 1 on."""
+
+    step_id: StepId
+
+
+class ExtendRequest(Document):
+    """The soak that takes longer, and by how much."""
+
+    step_id: StepId
+    by_s: Annotated[float, Typed("minutes", unit=60.0, help="How much longer, in minutes.")] = Field(
+        gt=0, le=31_622_400
+    )
+
+
+class SubmitRequest(RunRequest):
+    """A run that is asked for. key: the caller's own word for it: asked again with it, nothing is queued twice."""
+
+    key: str = Field(default="", max_length=200)
+
+
+class CancelRequest(Document):
+    """A run of the queue."""
+
+    run: RunNumber
+
+
+class MoveRequest(Document):
+    """1 is the next to be run."""
+
+    run: RunNumber
+    to: int = Field(ge=1, le=1_000_000)
+
+
+class ResumeRequest(Document):
+    """The name of a session."""
+
+    session: SessionName
+
+
+class DeviceRequest(Document):
+    """What a verb of a device is given, by name: GET /api/v1/devices has the arguments that each takes."""
+
+    device: SessionName
+    verb: SessionName
+    arguments: dict[str, JsonValue] = Field(default_factory=dict)
+
+
+class NoteRequest(Document):
+    """A sentence about a session, tags to find it by, or both."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [
+                {"properties": {"text": {"pattern": r"\S"}}, "required": ["text"]},
+                {"properties": {"tags": {"minItems": 1}}, "required": ["tags"]},
+            ]
+        }
+    )
+
+    session: SessionName
+    text: str = Field(default="", max_length=LONGEST_NOTE)
+    tags: tuple[Tag, ...] = Field(default=(), max_length=32)
+
+
+class Daemon(Protocol):
+    """What a stand has besides its runs when a daemon owns it for days."""
+
+    orders: Orders
+
+    def stop(self) -> None:
+        """The stand is made safe at once; a run that has it ends."""
+        ...
+
+    def seen(self) -> dict[str, object]:
+        """The fields of the state that are a daemon's."""
+        ...
+
+    def devices(self) -> tuple[DeviceState, ...]:
+        """What is there, and what it takes by hand now."""
+        ...
+
+    async def do_by_hand(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
+        """What came of it within a moment, as a sentence."""
+        ...
+
+    def wake(self) -> None:
+        """There may be something to be run."""
+        ...
+
+    def note(self) -> None:
+        """Write down what the next daemon has to know."""
+        ...
+
+    def clear_queue(self) -> None:
+        """A queue that was halted goes on."""
+        ...
+
+
+class StandService(Served):
+    """Of an open stand; without a daemon it is that of one run."""
+
+    def __init__(self, open_stand: OpenStand, daemon: Daemon | None = None) -> None:
+        assembly = open_stand.assembly
+        super().__init__(assembly.hub, assembly.clock)
+        self._open_stand = open_stand
+        self._daemon = daemon
+        self._assembly = assembly
+
+    def state(self) -> StandState:
+        """As it is now."""
+        assembly, run, daemon = self._assembly, self._run, self._daemon
+        changes: dict[str, object] = {} if daemon is None else daemon.seen()
+        if run is not None:
+            changes.update(run.seen())
+        elif daemon is not None and self._open_stand.guest is not None:
+            changes["phase"] = "stopping" if daemon.orders.leaving else "running"
+        if (fault := (run and run.fault) or self._open_stand.latched) is not None:
+            since_ns = self._open_stand.fault_ns
+            changes["fault"] = FaultState(rule=fault.rule, text=fault.text, since_ns=since_ns, data=fault.data)
+        return seen_state(assembly.config, assembly.stand, self.hub, self.clock).model_copy(update=changes)
+
+    def plan(self) -> tuple[PlanStep, ...]:
+        """The plan in force; empty when nothing is run."""
+        return () if self._run is None else self._run.steps()
+
+    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """What an edit would say; nothing is ordered, so nothing is recorded."""
+        return self._running().check_edit(from_index, steps)
+
+    def devices(self) -> tuple[DeviceState, ...]:
+        """The commands that devices take by hand; none while one run has the stand for itself."""
+        if self._daemon is not None:
+            return self._daemon.devices()
+        return tuple(
+            DeviceState(
+                name=name,
+                kind=kind,
+                channels=tuple(channel for channel in self.hub.readings if channel.startswith(f"{name}.")),
+                refused="a run has the stand",
+            )
+            for name, kind in self._kinds().items()
+        )
+
+    async def known_faults(self) -> SimulatedFaults:
+        """Of the simulated laboratory."""
+        from thermostand.stand.running.simulated_faults import simulated_faults
+
+        return await simulated_faults(self._assembly)
+
+    def done(self, verb: str, text: str) -> Done:
+        """With what holds the run now, and what is still under way."""
+        stand = self._assembly.stand
+        reasons, moving = tuple(sorted(stand.gate.reasons)), tuple(stand.motions.texts)
+        return Done(verb=verb, text=text, reasons=reasons, moving=moving)
+
+    @command("/run/stop", anywhere=True)
+    def stop(self, who: Who) -> str:
+        """Make the stand safe and end the run, as Ctrl-C does. Needs no token and no body, in every state, as often as
+        you like.
+
+        Example: stand stop
+        """
+        if self._daemon is not None:
+            self._daemon.stop()
+        elif (guest := self._guest) is not None:
+            guest.stop()
+        return "the stand is made safe" + ("" if self._guest is None else ", and the run ends")
+
+    @command("/run/pause")
+    def pause(self, who: Who, given: PauseRequest) -> str:
+        """Hold the run before its next action; the chamber keeps its set-point, a dwell what it has earned.
+
+        Moves under way are completed, and the answer lists them; `stand stop` stops it. The flap is shut within a
+        minute. After guard.pause_limit_h the stand is made safe and held.
+
+        Example: stand pause && stand continue
+        """
+        run = self._running()
+        run.pauses_next = given.when == "step"
+        if not run.pauses_next:
+            self._assembly.stand.gate.hold(OPERATOR)
+        return pause_text(given.when)
+
+    @command("/run/continue")
+    def continue_(self, who: Who) -> str:
+        """End a pause, or the pause of a prompt.
+
+        Example: stand continue sessions/20260101T180000Z-thermal-cycle
+        """
+        self._running().go_on()
+        return held_text(self._assembly.stand.gate.reasons)
+
+    @command("/run/clear", has_verb=False)
+    def clear(self, who: Who) -> str:
+        """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
+        daemon, gate = self._daemon, self._assembly.stand.gate
+        if INTERLOCK not in gate.reasons and (daemon is None or not daemon.orders.queued.halted):
+            raise Conflict(f"there is nothing to clear: no interlock holds this {'run' if daemon is None else 'stand'}")
+        gate.clear(INTERLOCK)
+        if daemon is not None:
+            daemon.note()
+            if self._open_stand.latched is None:
+                daemon.clear_queue()
+        return self._open_stand.cleared()
+
+    @command("/run/skip")
+    async def skip(self, who: Who, given: SkipRequest) -> str:
+        """Leave a step out, or break it off. Durable when it is answered.
+
+        Frames after a soak that was left out are flagged `unsettled`, and a fit leaves them out.
+
+        Example: stand skip 12
+        """
+        run, step_id = self._step(given.step_id)
+        await _changed(run.executor.skip(step_id))
+        return f"step {given.step_id} is left out"
+
+    @command("/run/extend")
+    async def extend(self, who: Who, given: ExtendRequest) -> str:
+        """Soak for longer in a step. Durable when it is answered.
+
+        Example: stand extend 12 30
+        """
+        run, step_id = self._step(given.step_id)
+        await _changed(run.executor.extend(step_id, given.by_s))
+        return f"step {given.step_id} takes {given.by_s / 60.0:g} min longer"
+
+    @command("/run/plan", http="PUT", has_verb=False)
+    async def edit(self, who: Who, given: PlanRequest) -> str:
+        """Replace the steps from a place on, none of which was begun. Durable when it is answered."""
+        count = await self._running().edit(given.from_index, given.steps)
+        return f"the steps from number {given.from_index + 1} on are replaced by {count} others"
+
+    @command("/queue", status=201, has_verb=False, by_secop="recipe")
+    async def submit(self, who: Who, given: SubmitRequest) -> QueuedRun:
+        """Check a run and queue it. With the key of an earlier one: that one; 409 when its request was another."""
+        daemon = self._queueing()
+        order = RunRequest.model_validate(given.model_dump(exclude={"key"}))
+        entry = await daemon.orders.submit(who, order, given.key)
+        daemon.wake()
+        return daemon.orders.shown_run(entry)
+
+    @command("/queue/{run}", http="DELETE", has_verb=False)
+    async def cancel(self, who: Who, given: CancelRequest) -> str:
+        """Take a run out of the queue; what it has recorded stays."""
+        daemon = self._queueing()
+        await daemon.orders.cancel(given.run)
+        daemon.wake()
+        return f"run {given.run} is out of the queue"
+
+    @command("/queue/{run}/move", has_verb=False)
+    async def move(self, who: Who, given: MoveRequest) -> str:
+        """Change when a run has its turn."""
+        await self._queueing().orders.move(given.run, given.to)
+        return f"run {given.run} has turn {given.to}"
+
+    @command("/sessions/{session}/resume", has_verb=False)
+    async def resume(self, who: Who, given: ResumeRequest) -> str:
+        """Resume an interrupted run in its session; it is the next one."""
+        if self._daemon is None:
+            raise Conflict("a run has the stand; a session is resumed when it has ended")
+        if self._open_stand.latched is not None:
+            raise Conflict("the stand has tripped; clear it first")
+        entry = await self._daemon.orders.resume(given.session)
+        self._daemon.wake()
+        return f"run {entry.id} is resumed next"
+
+    @command("/devices/{device}/{verb}", has_verb=False)
+    async def device(self, who: Who, given: DeviceRequest) -> str:
+        """Tell a device something between runs, through the same gate as a run. What takes longer than a moment goes on
+        when this is answered, and its failure is an event."""
+        if self._daemon is not None:
+            return await self._daemon.do_by_hand(given.device, given.verb, given.arguments)
+        if given.device not in (kinds := self._kinds()):
+            raise Missing(f"this stand has no device of that name; there are {', '.join(kinds)}")
+        raise Conflict("a run has the stand; pause does not change that, STOP ends the run")
+
+    @command("/sessions/{session}/notes", has_verb=False, by_secop=None)
+    async def note(self, who: Who, given: NoteRequest) -> str:
+        """Add a note and tags to a session, running or finished."""
+        from thermostand.stand.running.said import Said, keep
+
+        said = Said(who, given.text, given.tags)
+        await keep(said, *await self._notes_of(given.session), self.hub, self.clock)
+        return "noted"
+
+    @command("/simulator/faults", has_verb=False, by_secop=None)
+    async def fault(self, who: Who, given: FaultRequest) -> str:
+        """Break something of the simulated laboratory on purpose, or mend it; 409 for a real stand."""
+        from thermostand.stand.running.simulated_faults import break_or_mend
+
+        return await break_or_mend(self._assembly, given)
+
+    @property
+    def patience(self) -> Patience:
+        """Of a stand that is closed."""
+        return self._open_stand.patience
+
+    @property
+    def _guest(self) -> Guest | None:
+        return cast("Guest | None", self._open_stand.guest)
+
+    @property
+    def _run(self) -> Course | None:
+        """Of the run that has the stand, once it can be asked anything."""
+        guest = self._guest
+        return None if guest is None else guest.course
+
+    def _running(self) -> Course:
+        run = self._run
+        if run is None:
+            raise Conflict(_NOTHING_RUNS)
+        if run.stop.phase in _ENDING:
+            raise Conflict("the run is being ended: the stand is made safe, and nothing else is done")
+        return run
+
+    def _step(self, wanted: str) -> tuple[Course, str]:
+        """A step of the run, by its id, or by its number in the plan."""
+        run = self._running()
+        plan = run.log.state.plan
+        found = [each.step_id for each in plan if wanted in (each.step_id, str(each.index + 1))]
+        if not found:
+            raise Missing(f"the plan has no step {wanted}; `stand status --plan` shows those there are")
+        return run, found[0]
+
+    def _queueing(self) -> Daemon:
+        if self._daemon is None:
+            raise Conflict(_NO_QUEUE)
+        return self._daemon
+
+    def _kinds(self) -> Mapping[str, str]:
+        from thermostand.stand.assembly import device_kinds
+
+        return device_kinds(self._assembly.config)
+
+    async def _notes_of(self, session: str) -> tuple[Path, DiskCalls]:
+        """The folder of a session, and what writes its file of notes."""
+        if self._daemon is not None:
+            orders = self._daemon.orders
+            return await orders.reading.call(orders.folder_of, session), orders.notes
+        run = self._running()
+        if session != run.directory.name:
+            raise Missing(f"the session under way is {run.directory.name}; others get notes from `stand session`")
+        return run.directory, run.notes
+
+
+def pause_text(when: When) -> str:
+    """What is said of a pause."""
+    begins = "pauses when the step under way is done" if when == "step" else "paused"
+    return f"{begins}; `stand continue` ends the pause"
+
+
+def held_text(reasons: Collection[str]) -> str:
+    """Whether the run continues, and if not, what may be done about it."""
+    if not reasons:
+        return "the run continues"
+    known = [ENDINGS[reason] for reason in sorted(reasons) if reason in (OPERATOR, INTERLOCK)]
+    return "; ".join([f"still held: {', '.join(sorted(reasons))}", *known])
+
+
+async def _changed(change: Coroutine[None, None, None]) -> None:
+    """What cannot be done with a plan as it is: Conflict."""
+    try:
+        await change
+    except (ConfigError, SessionError) as error:
+        raise Conflict(str(error)) from error

@@ -1,0 +1,256 @@
+"""What an operator may order: one method of a stand's service with one typed argument.
+
+    @command("/run/skip")
+    async def skip(self, who: Who, given: SkipRequest) -> str:
+        "Leave a step out, or break it off."
+
+From it follow the route and its OpenAPI (api/order_routes.py), the verb of the command line (commands/verbs.py), the
+command that is recorded (`perform`), SECoP's command of the module `run`, and what the page's buttons are called
+(`GET /api/v1/commands`).
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Any, Literal, TypeVar, cast, get_type_hints
+
+from pydantic import BaseModel, JsonValue
+
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import StandError
+from thermostand.foundation.events import COMMAND
+from thermostand.foundation.hub import Hub
+from thermostand.stand.serving.desk import (
+    DeviceState,
+    Done,
+    PlanCheck,
+    PlanStep,
+    SimulatedFaults,
+    StandState,
+    Who,
+    WrittenStep,
+)
+
+STOP = "stop"
+_MARK = "__command__"
+_LONGEST = 200  # characters of a text that an event has; a recipe has more, and is kept by its session
+
+Method = TypeVar("Method", bound=Callable[..., object])
+Http = Literal["POST", "PUT", "DELETE"]
+
+
+@dataclass(frozen=True, slots=True)
+class Typed:
+    """How a field of an argument is typed on the command line: by this name, `unit` of it being one there. value: it is
+    a flag that stands for this value."""
+
+    name: str
+    help: str = ""
+    unit: float | None = None
+    value: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    path: str
+    http: Http
+    status: int
+    has_verb: bool
+    anywhere: bool
+    by_secop: str | None
+
+
+def command(
+    path: str,
+    *,
+    http: Http = "POST",
+    status: int = 200,
+    has_verb: bool = True,
+    anywhere: bool = False,
+    by_secop: str | None = "",
+) -> Callable[[Method], Method]:
+    """A method is a command, at this path below /api/v1, in which {name} is a field of its argument.
+
+    It takes who asks and, if anything, one Document, and returns a sentence, for the answer Done, or a value. It raises
+    Conflict when the state forbids it, Missing, or ConfigError when the argument is wrong. has_verb: the command line
+    has a verb for it. anywhere: that verb finds the only stand of this machine. by_secop: the field that SECoP's
+    command takes, "" for the only one that is required, None for no such command.
+    """
+
+    def mark(method: Method) -> Method:
+        setattr(method, _MARK, _Mark(path, http, status, has_verb, anywhere, by_secop))
+        return method
+
+    return mark
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """name: as it is typed and recorded. text: of its docstring. argument: None when it takes none."""
+
+    name: str
+    method: str
+    text: str
+    argument: type[Document] | None
+    answer: type[BaseModel]
+    path: str
+    http: Http
+    status: int
+    has_verb: bool
+    anywhere: bool
+    by_secop: str | None
+
+    @property
+    def title(self) -> str:
+        """What a button is called."""
+        return self.name.replace("_", " ").capitalize()
+
+    @property
+    def secop_field(self) -> str | None:
+        """What SECoP's command takes, "" for nothing; None when there is none."""
+        fields = {} if self.argument is None else self.argument.model_fields
+        needed = [name for name, info in fields.items() if info.is_required()]
+        return self.by_secop if self.by_secop or self.by_secop is None else _only(needed)
+
+    @property
+    def summary(self) -> str:
+        """The first paragraph of its text, as one line."""
+        return " ".join(takewhile(bool, self.text.splitlines()))
+
+    @property
+    def in_path(self) -> tuple[str, ...]:
+        """The fields of its argument that stand in its path."""
+        return tuple(re.findall(r"{(\w+)}", self.path))
+
+
+def _only(names: Sequence[str]) -> str | None:
+    return None if len(names) > 1 else "".join(names)
+
+
+def commands_of(service: type[Served]) -> dict[str, Command]:
+    """Every command of a service, by name, those of its bases first."""
+    marked: dict[str, tuple[Callable[..., object], _Mark]] = {}
+    for each in reversed(service.__mro__):
+        for name, method in vars(each).items():
+            if isinstance(mark := getattr(method, _MARK, None), _Mark):
+                marked[name] = method, mark
+    return {each.name: each for each in (_command(name, *found) for name, found in marked.items())}
+
+
+def _command(method_name: str, method: Callable[..., object], mark: _Mark) -> Command:
+    hints = get_type_hints(method)
+    answer = hints.pop("return")
+    argument = [hint for hint in hints.values() if hint is not Who]
+    return Command(
+        method_name.rstrip("_"),
+        method_name,
+        inspect.getdoc(method) or "",
+        cast("type[Document]", argument[0]) if argument else None,
+        Done if answer is str else cast("type[BaseModel]", answer),
+        mark.path,
+        mark.http,
+        mark.status,
+        mark.has_verb,
+        mark.anywhere,
+        mark.by_secop,
+    )
+
+
+class Served(ABC):
+    """What clients see of a stand. All of it is called on the control loop and returns quickly: no method waits for a
+    wire, and what waits for a disk is `async` and stands in nobody's way."""
+
+    def __init__(self, hub: Hub, clock: Clock) -> None:
+        self.hub = hub
+        self.clock = clock
+        self.commands = commands_of(type(self))
+
+    @abstractmethod
+    def state(self) -> StandState:
+        """As it is now."""
+
+    @abstractmethod
+    def plan(self) -> tuple[PlanStep, ...]:
+        """The plan in force; empty when nothing is run. With `check_edit` what any thread may call: a long plan takes a
+        while, so it reads values only that are replaced and never changed."""
+
+    @abstractmethod
+    def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
+        """What the command `edit` would say; changes nothing. Any thread may call it. Conflict when nothing is run."""
+
+    @abstractmethod
+    def devices(self) -> tuple[DeviceState, ...]:
+        """The commands that devices take by hand."""
+
+    @abstractmethod
+    async def known_faults(self) -> SimulatedFaults:
+        """What can be broken on purpose; Conflict when the stand is no simulated one."""
+
+    @abstractmethod
+    def done(self, verb: str, text: str) -> Done:
+        """The answer to a command of which that sentence came."""
+
+    def perform(self, name: str, who: Who, given: Document | None = None) -> BaseModel | Awaitable[BaseModel]:
+        """Do a command, and record who asked for it and what came of it; raises what it raises. One that awaits
+        nothing, as STOP, is done when this returns."""
+        found = self.commands[name]
+        try:
+            came = getattr(self, found.method)(who, *(() if found.argument is None else (given,)))
+        except StandError as error:
+            self.record(who, name, given, f"refused: {error}")
+            raise
+        if inspect.isawaitable(came):
+            return self._completed(who, name, given, came)
+        return self._came(who, name, given, came)
+
+    async def _completed(self, who: Who, name: str, given: Document | None, work: Awaitable[Any]) -> BaseModel:
+        try:
+            came = await work
+        except StandError as error:
+            self.record(who, name, given, f"refused: {error}")
+            raise
+        return self._came(who, name, given, came)
+
+    def _came(self, who: Who, name: str, given: Document | None, came: object) -> BaseModel:
+        self.record(who, name, given)
+        return self.done(name, came) if isinstance(came, str) else cast("BaseModel", came)
+
+    def record(self, who: Who, name: str, given: Document | None, result: str = "done") -> None:
+        """The event of a command: who, how, what, and what came of it."""
+        arguments = recorded(given)
+        data = {"who": who.name, "how": who.how, "verb": name, "arguments": arguments, "result": result}
+        self.hub.publish(COMMAND.at(self.clock.now_ns(), in_words(name, arguments), **data))
+
+
+def recorded(given: Document | None) -> dict[str, JsonValue]:
+    """What an event has of an argument: no long text, of steps how many there are, nothing that is empty, and no flag
+    that was not set."""
+    if given is None:
+        return {}
+    values = given.model_dump(mode="json")
+    found = {name: len(value) if name == "steps" else value for name, value in values.items()}
+    unset = {name for name, info in type(given).model_fields.items() if info.default is False and not values[name]}
+    return {name: value for name, value in found.items() if name not in unset and not _is_left_out(value)}
+
+
+def _is_left_out(value: object) -> bool:
+    return value is None or value in ("", [], {}) or (isinstance(value, str) and len(value) > _LONGEST)
+
+
+def in_words(verb: str, arguments: Mapping[str, JsonValue]) -> str:
+    """`pause when=now`, `skip step_id=0-soak`, `flap open`, `linear move position=12.0`."""
+    if verb == "device":
+        given = arguments.get("arguments")
+        pairs = _pairs(given) if isinstance(given, Mapping) else []
+        return " ".join([str(arguments.get("device")), str(arguments.get("verb")), *pairs])
+    return " ".join([verb, *_pairs({name: value for name, value in arguments.items() if name != "key"})])
+
+
+def _pairs(arguments: Mapping[str, JsonValue]) -> list[str]:
+    return [f"{name}={value}" for name, value in arguments.items() if value not in ("", [], None)]

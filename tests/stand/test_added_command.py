@@ -1,0 +1,108 @@
+"""A command that is added outside of the program, as one method of a service, is found everywhere."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import Field
+from typer.testing import CliRunner
+
+from tests.stand.secop_desk import SecopDesk, node
+from tests.stand.secop_talk import talking
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import SessionError
+from thermostand.foundation.items import Event, Item
+from thermostand.stand.commands.verbs import app_of
+from thermostand.stand.serving.client import server_of
+from thermostand.stand.serving.commands import command, commands_of
+from thermostand.stand.serving.desk import Conflict, Who
+
+
+class FlushRequest(Document):
+    """How long dry air is blown."""
+
+    for_s: float = Field(gt=0, le=60, description="Seconds.")
+    gently: bool = False
+
+
+class Flushing(SecopDesk):
+    """A service with one more command."""
+
+    @command("/run/flush")
+    async def flush(self, who: Who, given: FlushRequest) -> str:
+        """Blow dry air through the chamber.
+
+        Example: stand flush 5
+        """
+        if given.for_s > 30:
+            raise Conflict("there is air for 30 s")
+        return f"flushed for {given.for_s:g} s" + (", gently" if given.gently else "")
+
+
+def test_it_is_in_the_table_with_its_words():
+    found = commands_of(Flushing)["flush"]
+    assert (found.title, found.summary) == ("Flush", "Blow dry air through the chamber.")
+    assert "flush" not in commands_of(SecopDesk)
+
+
+async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp_path: Path):
+    async with node(Flushing(), tmp_path):
+        server = server_of(tmp_path / "night")
+
+        async def ask(method: str, path: str, body: dict[str, object] | None = None) -> Any:
+            return await asyncio.to_thread(server.request, method, path, body)
+
+        answer = await ask("POST", "/api/v1/run/flush", {"for_s": 5, "gently": True})
+        assert answer["verb"] == "flush"
+        assert answer["text"] == "flushed for 5 s, gently"
+        assert answer["seq"] > 0
+        with pytest.raises(SessionError, match=r"for_s: .*less than or equal to 60"):
+            await ask("POST", "/api/v1/run/flush", {"for_s": 61})
+        document = await ask("GET", "/openapi.json")
+        entry = document["paths"]["/api/v1/run/flush"]["post"]
+        assert entry["description"].startswith("Blow dry air through the chamber.")
+        body = entry["requestBody"]["content"]["application/json"]["schema"]["$ref"].rpartition("/")[2]
+        assert document["components"]["schemas"][body]["properties"]["for_s"]["maximum"] == 60
+        (row,) = [each for each in await ask("GET", "/api/v1/commands") if each["name"] == "flush"]
+        assert row == {
+            "name": "flush",
+            "title": "Flush",
+            "text": "Blow dry air through the chamber.",
+            "method": "POST",
+            "path": "/api/v1/run/flush",
+        }
+
+
+async def test_it_is_a_verb_of_the_command_line(tmp_path: Path):
+    async with node(Flushing(), tmp_path):
+        typed = ["flush", "5", str(tmp_path / "night"), "--gently"]
+        done = await asyncio.to_thread(CliRunner().invoke, app_of(Flushing), typed)
+        shown = CliRunner().invoke(app_of(Flushing), ["flush", "--help"], prog_name="stand")
+    assert done.stdout == f"{tmp_path / 'night'}: flushed for 5 s, gently\n"
+    assert "Example: stand flush 5" in shown.output
+    assert "Seconds." in shown.output
+
+
+async def test_secop_has_it_and_each_order_is_recorded_with_what_came_of_it(tmp_path: Path):
+    desk, told = Flushing(), list[Event]()
+
+    def follow(item: Item) -> None:
+        if isinstance(item, Event) and item.kind == "command":
+            told.append(item)
+
+    desk.hub.subscribe(follow)
+    async with node(desk, tmp_path) as port, talking(port) as talk:
+        described = (await talk.asked("describe"))[2]["modules"]["run"]["accessibles"]["_flush"]
+        assert described["datainfo"]["argument"]["type"] == "double"
+        assert (await talk.asked("do run:_flush 5"))[0] == "done"
+        assert (await talk.asked("do run:_flush 61"))[2][0] == "RangeError"
+        assert (await talk.asked("do run:_flush 40"))[2][:2] == ["Impossible", "there is air for 30 s"]
+    assert [each.text.partition(": ")[2] for each in told] == [
+        "flush for_s=5.0",
+        "flush for_s=40.0: refused: there is air for 30 s",
+    ]
+    assert [(each.data["verb"], each.data["arguments"], each.data["result"]) for each in told] == [
+        ("flush", {"for_s": 5.0}, "done"),
+        ("flush", {"for_s": 40.0}, "refused: there is air for 30 s"),
+    ]
