@@ -25,7 +25,7 @@ SHOWN = {
     ("recording/reading/glance.py", "within"),
     ("compensation/commands/photographs_cli.py", "views_of"),
     # Compared with what was said before and nothing else: whether a message repeats.
-    ("foundation/repeats.py", "admit"),
+    ("foundation/repeats.py", "_of_sentence"),
 }
 
 
