@@ -23,18 +23,16 @@ PLACE, CAMERA, AMBIENT, SWITCHED_ON, HISTORY, STATE = 1, 2, 4, 8, 16, 32
 calibrated range; the camera was switched on too recently; it has not been followed for long enough; each is in its
 range, but not in this combination."""
 
-VERSION = 3
+VERSION = 4
 """Of the JSON file. From thermostand 0.2.0 on each version reads the files of all before it."""
 
-RATE_TAU_S = 600.0
-"""The ambient's rate of change is that of its 10 min lag."""
 SETTLED_TAUS = 3.0
 """After so many time constants a state that began with a guess has forgotten it (5 % are left)."""
 COLD_K = 3.0
 """A camera this close to the air around it has been off for long: nothing of it is warm."""
 UNPOWERED_TAU_S = 900.0
 """An unpowered camera reports no temperature; its excess over the air is assumed to decay so until it does."""
-SPAN_K, HULL_MARGIN_PX = 20.0, 1.0
+HULL_MARGIN_PX = 1.0
 COLDEST_degC, HOTTEST_degC = -273.15, 1000.0
 MOST_CORNERS = 2000
 """Of a hull: that of a night's markers has about 40. Each point is compared with each corner."""
@@ -47,52 +45,102 @@ digits."""
 _MARGIN, _SWITCHED_ON_S, _MORE_LEVERAGE = 0.02, 1.0, 3.0
 
 
+_OPERATIONS = {
+    "+": lambda one, other: one + other,
+    "-": lambda one, other: one - other,
+    "*": lambda one, other: one * other,
+    "/": lambda one, other: one / other,
+    "**": lambda one, other: one**other,
+}
+INPUTS = (("camera",), ("air",), ("power",))
+"""Of a thermal state: temperature of the camera and of the air near it, degC, and its supply, 0..1. Expressions are
+made of these and of numbers: (operation, one, other); ("lag", of, tau_s), a first-order follower; ("play", of,
+radius_K), a Prandtl-Ishlinskii play, which stays where it is until what it follows is further away than its radius."""
+
+
+def compiled(expression, at):
+    """A function of a list of values, numbers or arrays: what the expression is of them. at: where inputs, lags and
+    plays are in the list. ValueError for what is no expression of these."""
+    if isinstance(expression, (int, float)):
+        return lambda values: expression
+    if expression in at:
+        place = at[expression]
+        return lambda values: values[place]
+    if len(expression) != 3 or expression[0] not in _OPERATIONS:
+        raise ValueError(f"{expression} is no expression of a thermal state")
+    operation = _OPERATIONS[expression[0]]
+    one, other = (compiled(part, at) for part in expression[1:])
+    return lambda values: operation(one(values), other(values))
+
+
+def remembered(expressions):
+    """The lags and plays in the expressions, each once and after those it is made of."""
+    found = {}
+    for expression in expressions:
+        if isinstance(expression, tuple):
+            found.update(dict.fromkeys(remembered(expression[1:])))
+            if expression[0] in ("lag", "play"):
+                found[expression] = None
+    return tuple(found)
+
+
+class Follower:
+    """Lags and plays, each after those it is made of, followed in a list of values: the inputs, then these. The values
+    are numbers, or arrays of many cameras. at: where each is in the list."""
+
+    def __init__(self, parts):
+        """ValueError for what is no lag or play of known ones."""
+        self.at = {one: place for place, one in enumerate(INPUTS)}
+        self.parts = []
+        for part in parts:
+            self.parts.append((len(self.at), compiled(part[1], self.at), part[0] == "play", part[2]))
+            self.at[part] = len(self.at)
+        self.taus_s = np.array([size for _, _, is_play, size in self.parts if not is_play])
+
+    def rest(self, values):
+        """The values with those of equilibrium at these inputs."""
+        values = list(values)
+        for _, followed, _, _ in self.parts:
+            values.append(followed(values))
+        return values
+
+    def follow(self, now, mean, gained, clip):
+        """Move lags and plays on, in place. now: with new inputs; mean: with their means over the time that has passed.
+        gained: 1 - exp(-dt / tau) of each lag, exact for a constant input."""
+        gained = iter(gained)
+        for place, followed, is_play, radius_K in self.parts:
+            if is_play:
+                push = followed(now)
+                now[place] = mean[place] = clip(now[place], push - radius_K, push + radius_K)
+            else:
+                before = now[place]
+                now[place] = before + (followed(mean) - before) * next(gained)
+                mean[place] = (before + now[place]) / 2
+
+
 class ThermalState:
     """The thermal state of one camera, followed from sample to sample.
 
     It begins, and begins again after a gap, in equilibrium: lags of temperatures at these temperatures, lags of the
     power at the part of its self-heating that the camera shows. Unless the camera is as cold as the air when it is
     first seen, or when it is switched on after it was unpowered until then, that is a guess, which is forgotten after
-    about three of the time constants. camera_degC, air_degC: the last ones.
-    ambient_lag, power_lag, camera_lag: the 10 min lag, then one for each of taus_s. plays: one for each of plays_K,
-    then one for each of part_plays.
+    about three of the time constants. values: camera, air and supply now, then lags and plays as `memory` lists them.
     settled_s: how long ago the state was a guess. on_s: since the camera was switched on. begun: False in a gap.
     """
 
-    def __init__(self, taus_s, plays_K, self_heating_K, part_plays=()):
-        """taus_s: time constants, s. plays_K: radii. self_heating_K: over the air of a camera that has been on for
-        long. part_plays: (time constant of taus_s, share, radius) of parts between air and camera, which follow both
-        late and have that share (0..1) of the camera's excess."""
-        self._taus_s = np.array([RATE_TAU_S, *taus_s])
-        self._radii_K = [float(radius_K) for radius_K in (*plays_K, *(part[2] for part in part_plays))]
-        self._parts = [(1 + list(taus_s).index(tau_s), float(share)) for tau_s, share, _ in part_plays]
+    def __init__(self, memory, self_heating_K):
+        """memory: lags and plays. self_heating_K: over the air of a camera that has been on for long."""
+        self.memory = Follower(memory)
         self._self_heating_K = self_heating_K
-        self._dt_s = self._gained = math.nan
+        self._dt_s, self._gained = math.nan, []
         self.begun = self._unseen = False
-        self.settled_s = self.on_s = self.air_degC = self.camera_degC = math.nan
-        # Lists: for so few numbers numpy takes three times as long.
-        self._ambient = self._power = self._camera = [math.nan] * len(self._taus_s)
-        self._plays = [math.nan] * len(self._radii_K)
+        self.settled_s = self.on_s = math.nan
+        self.values = [math.nan] * len(self.memory.at)  # a list: for so few numbers numpy takes three times as long
 
     @property
-    def ambient_lag(self):
-        """(1 + K,)."""
-        return np.array(self._ambient)
-
-    @property
-    def power_lag(self):
-        """(1 + K,)."""
-        return np.array(self._power)
-
-    @property
-    def camera_lag(self):
-        """(1 + K,)."""
-        return np.array(self._camera)
-
-    @property
-    def plays(self):
-        """(P,)."""
-        return np.array(self._plays)
+    def camera_degC(self):
+        """Its temperature, as it was told or is assumed."""
+        return self.values[0]
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them
@@ -104,32 +152,19 @@ class ThermalState:
             return
         if not self.begun:
             self._begin(ambient_degC, power_on, camera_degC)
-        before_degC = self.camera_degC
-        excess_K = (before_degC - self.air_degC) * math.exp(-dt_s / UNPOWERED_TAU_S)
-        self.air_degC = ambient_degC
-        self.camera_degC = ambient_degC + excess_K if math.isnan(camera_degC) else camera_degC
-        # First-order followers of a constant input, exactly: z + (s - z)(1 - exp(-dt/tau)); and Prandtl-Ishlinskii
-        # plays, which stay where they are until the camera is further away than their radius.
+        before_degC, air_degC, _, *before = self.values
+        excess_K = (before_degC - air_degC) * math.exp(-dt_s / UNPOWERED_TAU_S)
+        own_degC = ambient_degC + excess_K if math.isnan(camera_degC) else camera_degC
         if dt_s != self._dt_s:
-            self._dt_s, self._gained = dt_s, (-np.expm1(-dt_s / self._taus_s)).tolist()
-        self._ambient = _followed(self._ambient, ambient_degC, self._gained)
-        self._power = _followed(self._power, power_on, self._gained)
-        self._camera = _followed(self._camera, (before_degC + self.camera_degC) / 2, self._gained)
-        self._plays = [
-            low if play < low else high if play > high else play
-            for play, push_degC, radius_K in zip(self._plays, self._pushes(), self._radii_K, strict=True)
-            for low, high in ((push_degC - radius_K, push_degC + radius_K),)
-        ]
+            self._dt_s, self._gained = dt_s, (-np.expm1(-dt_s / self.memory.taus_s)).tolist()
+        self.values = [own_degC, ambient_degC, power_on, *before]
+        mean = [(before_degC + own_degC) / 2, ambient_degC, power_on, *before]
+        self.memory.follow(self.values, mean, self._gained, _clipped)
         if self._unseen and not math.isnan(camera_degC):
             self._unseen = False
             self.settled_s = math.inf if abs(camera_degC - ambient_degC) < COLD_K else self.settled_s
         self.settled_s += dt_s
         self.on_s = self.on_s + dt_s if power_on == 1 else dt_s * power_on
-
-    @property
-    def rate_K_per_h(self):
-        """How fast the ambient changes."""
-        return 3600 / RATE_TAU_S * (self.air_degC - self._ambient[0])
 
     def _begin(self, ambient_degC, power_on, camera_degC):
         excess_K = 0.0 if math.isnan(camera_degC) else camera_degC - ambient_degC
@@ -139,21 +174,11 @@ class ThermalState:
         self._unseen = power_on == 0 and math.isnan(camera_degC)
         self.settled_s = math.inf if cold else 0.0
         self.on_s = 0.0 if cold or power_on == 0 else math.inf
-        self.air_degC, self.camera_degC = ambient_degC, ambient_degC + excess_K
-        self._ambient, self._power, self._camera = (
-            [float(at)] * len(self._taus_s) for at in (ambient_degC, warmed, self.camera_degC)
-        )
-        self._plays = self._pushes()
-
-    def _pushes(self):
-        """What moves each play: the camera, or a part."""
-        ambient, camera = self._ambient, self._camera
-        parts = [ambient[at] + share * (camera[at] - ambient[at]) for at, share in self._parts]
-        return [self.camera_degC] * (len(self._radii_K) - len(parts)) + parts
+        self.values = self.memory.rest([ambient_degC + excess_K, float(ambient_degC), warmed])
 
 
-def _followed(lags, value, gained):
-    return [lag + (value - lag) * part for lag, part in zip(lags, gained, strict=True)]
+def _clipped(value, low, high):
+    return low if value < low else high if value > high else value
 
 
 class Drift:
@@ -167,13 +192,12 @@ class Drift:
         self._model = model
         self._coefficients = np.array(model["coefficients_px"])
         self._hull_px = np.array(model["hull_px"])
-        self._state = ThermalState(
-            model.get("taus_s", []),
-            model.get("plays_K", []),
-            model.get("self_heating_K", math.nan),
-            model.get("part_plays", []),
-        )
         self._camera_degC = math.nan
+        terms = [expression_of(term) for term in model.get("terms", [])]
+        self.ambient_lag = ("lag", ("air",), model.get("ambient_tau_s"))
+        memory = remembered([*terms, self.ambient_lag]) if terms else ()
+        self.state = ThermalState(memory, model.get("self_heating_K", math.nan))
+        self._terms = [compiled(term, self.state.memory.at) for term in terms]
 
     @classmethod
     def load(cls, path):
@@ -198,16 +222,16 @@ class Drift:
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
         """As ThermalState.advance."""
-        self._state.advance(dt_s, ambient_degC, power_on, camera_degC)
+        self.state.advance(dt_s, ambient_degC, power_on, camera_degC)
         measured = camera_degC if is_temperature(camera_degC) else math.nan
-        self._camera_degC = self._state.camera_degC if self._state.begun else measured
+        self._camera_degC = self.state.camera_degC if self.state.begun else measured
 
     def shift(self, points_px):
         """Displacement (N, 2), px, of points (N, 2) to where they would be at the reference; NaN before `advance`."""
         points_px = np.asarray(points_px, float)
         if self._model["form"] == "paper":
             return self._polynomial(points_px) @ self._coefficients.T
-        if not self._state.begun:
+        if not self.state.begun:
             return np.full_like(points_px, np.nan)
         amounts = self._coefficients @ self._away()
         return self._moved(points_px, amounts)
@@ -267,36 +291,10 @@ class Drift:
         chebyshev = [np.polynomial.chebyshev.chebvander(values, int(max(a))) for values in (i, j, t)]
         return chebyshev[0][:, a] * chebyshev[1][:, b] * chebyshev[2][:, c]
 
-    def _features(self):
-        """The terms of the thermal state."""
-        camera_degC, air_degC = self._model["reference_degC"], self._model["reference_ambient_degC"]
-        taus_s, radii_K = self._model["taus_s"], self._model["plays_K"]
-        parts = [tuple(part) for part in self._model["part_plays"]]
-        state, own = self._state, (self._state.camera_degC - camera_degC) / SPAN_K
-        values = []
-        for kind, parameter, *of_part in self._model["terms"]:
-            if of_part:
-                place_degC = state.plays[len(radii_K) + parts.index((*of_part, parameter))]
-                values.append((place_degC - air_degC - of_part[1] * (camera_degC - air_degC)) / SPAN_K)
-                continue
-            at = 1 + taus_s.index(parameter) if parameter in taus_s else 0
-            values.append(
-                {
-                    "constant": lambda: 1.0,
-                    "camera": lambda: own,
-                    "camera squared": lambda: own**2,
-                    "ambient lag": lambda at=at: (state.ambient_lag[at] - air_degC) / SPAN_K,
-                    "ambient lag squared": lambda at=at: ((state.ambient_lag[at] - air_degC) / SPAN_K) ** 2,
-                    "ambient lag cubed": lambda at=at: ((state.ambient_lag[at] - air_degC) / SPAN_K) ** 3,
-                    "camera lag": lambda at=at: (state.camera_lag[at] - camera_degC) / SPAN_K,
-                    "play": lambda r=parameter: (state.plays[radii_K.index(r)] - camera_degC) / SPAN_K,
-                }[kind]()
-            )
-        return np.array(values)
-
     def _away(self):
-        """The features minus those of the reference."""
-        return self._features() - np.array(self._model["reference_features"])
+        """The terms of the thermal state minus those of the reference."""
+        found = np.array([term(self.state.values) for term in self._terms])
+        return found - np.array(self._model["reference_features"])
 
     def _moved(self, points_px, amounts):
         """Eight infinitesimal motions of a homography: shift, affine, perspective."""
@@ -311,14 +309,14 @@ class Drift:
         found = _beyond(self._camera_degC, self.limits("camera_range_degC"), CAMERA)
         if self._model["form"] == "paper":
             return found
-        if not self._state.begun:
+        if not self.state.begun:
             return CAMERA | AMBIENT | SWITCHED_ON | HISTORY | STATE
-        found |= _beyond(self._state.on_s, (self.least_on_s, math.inf), SWITCHED_ON)
+        found |= _beyond(self.state.on_s, (self.least_on_s, math.inf), SWITCHED_ON)
         away, matrix = self._away(), np.array(self._model["leverage_matrix"])
         found |= _beyond(away @ matrix @ away, (0.0, self.most_leverage), STATE)
-        if self._model["taus_s"]:
-            found |= _beyond(self._state.ambient_lag[1], self.limits("ambient_range_degC"), AMBIENT)
-        return found | _beyond(self._state.settled_s, (self.memory_s, math.inf), HISTORY)
+        ambient_degC = self.state.values[self.state.memory.at[self.ambient_lag]]
+        found |= _beyond(ambient_degC, self.limits("ambient_range_degC"), AMBIENT)
+        return found | _beyond(self.state.settled_s, (self.memory_s, math.inf), HISTORY)
 
     def limits(self, name):
         """A calibrated range (low, high) with its margin; the paper's form has none."""
@@ -358,6 +356,18 @@ def _check(model):
     terms_px = np.abs(np.array(model["coefficients_px"], float)).sum(axis=1).max(initial=0.0)
     if not (min(size) > 0 and terms_px <= MOST_IMAGES * max(size)):
         raise ValueError(f"coefficients_px: terms of {terms_px:.3g} px, for an image of {max(size)}")
+
+
+def expression_of(value):
+    """Of the lists of a JSON file; ValueError for what no expression has."""
+    if isinstance(value, (list, tuple)):
+        found = tuple(map(expression_of, value))
+        if found[:1] in (("lag",), ("play",)) and (len(found) != 3 or not found[2] > 0):
+            raise ValueError(f"terms: {value} has no time constant or radius above 0")
+        return found
+    if isinstance(value, str) or (isinstance(value, (int, float)) and math.isfinite(value)):
+        return value
+    raise ValueError(f"terms: {value} is no number")
 
 
 def is_temperature(degC):

@@ -25,9 +25,8 @@ enum {
 typedef struct drift_state {
     int begun;  /* 0 in a gap */
     int unseen; /* 1 from a begin without power or temperature, until the camera tells one */
-    double air_degC, camera_degC, settled_s, on_s;
-    double ambient_lag[DRIFT_LAGS], camera_lag[DRIFT_LAGS];
-    double plays[DRIFT_PLAYS + 1];
+    double settled_s, on_s;
+    double values[DRIFT_VALUES]; /* degC of the camera and of the air, the supply, then lags and plays */
     unsigned flags;                /* of the state, for every position */
     double field[2][DRIFT_FIELD];  /* the displacement as polynomials of the position, px */
     float field_f32[2][DRIFT_FIELD];
@@ -43,37 +42,29 @@ static inline unsigned drift_beyond(double value, double low, double high, unsig
     return value >= low && value <= high ? 0u : flag;
 }
 
-/* The terms of the thermal state, less those of the reference. */
-static inline void drift_features(const drift_state *state, double values[DRIFT_TERMS]) {
-    int k;
-    for (k = 0; k < DRIFT_TERMS; ++k) {
-        const int at = drift_terms[k].at;
-        double value = 0.0;
-        switch (drift_terms[k].kind) {
-        case DRIFT_OF_CAMERA: value = state->camera_degC; break;
-        case DRIFT_OF_AMBIENT_LAG: value = state->ambient_lag[at]; break;
-        case DRIFT_OF_CAMERA_LAG: value = state->camera_lag[at]; break;
-        case DRIFT_OF_PLAY: value = state->plays[at]; break;
-        default: break;
-        }
-        value = (value - drift_terms[k].origin) / drift_terms[k].span;
-        {
-            double power = 1.0;
-            int n;
-            for (n = 0; n < drift_terms[k].power; ++n) power *= value;
-            values[k] = power - drift_terms[k].reference;
-        }
-    }
+/* A follower of an input with this mean over the time that has passed, exactly; and a play, which stays where it is until
+ * what pushes it is further away than its radius. */
+static inline void drift_lag(double *now, double *mean, int at, double input, double dt_s, double tau_s) {
+    const double before = now[at];
+    now[at] += (input - before) * -expm1(-dt_s / tau_s);
+    mean[at] = (before + now[at]) / 2;
 }
+
+static inline void drift_play(double *now, double *mean, int at, double push, double radius_K) {
+    now[at] = mean[at] = drift_clip(now[at], push - radius_K, push + radius_K);
+}
+
+/* Lags and plays in equilibrium, and moved on; the terms of the thermal state, less those of the reference. */
+/* the terms */
 
 static inline unsigned drift_state_flags(const drift_state *state, const double values[DRIFT_TERMS]) {
     unsigned found =
-        drift_beyond(state->camera_degC, drift_camera_range_degC[0], drift_camera_range_degC[1], DRIFT_CAMERA);
+        drift_beyond(state->values[0], drift_camera_range_degC[0], drift_camera_range_degC[1], DRIFT_CAMERA);
 #if DRIFT_THERMAL
     double leverage = 0.0;
     int k, l;
     if (!state->begun) return DRIFT_CAMERA | DRIFT_AMBIENT | DRIFT_SWITCHED_ON | DRIFT_HISTORY | DRIFT_STATE;
-    found |= drift_beyond(state->ambient_lag[1], drift_ambient_range_degC[0], drift_ambient_range_degC[1],
+    found |= drift_beyond(state->values[DRIFT_AMBIENT_LAG], drift_ambient_range_degC[0], drift_ambient_range_degC[1],
                           DRIFT_AMBIENT);
     found |= drift_beyond(state->on_s, DRIFT_LEAST_ON_S, HUGE_VAL, DRIFT_SWITCHED_ON);
     found |= drift_beyond(state->settled_s, DRIFT_MEMORY_S, HUGE_VAL, DRIFT_HISTORY);
@@ -91,7 +82,7 @@ static inline unsigned drift_state_flags(const drift_state *state, const double 
 static inline void drift_update(drift_state *state) {
     double values[DRIFT_TERMS];
     int axis, k, term;
-    drift_features(state, values);
+    drift_terms(state->values, values);
     state->flags = drift_state_flags(state, values);
     for (axis = 0; axis < 2; ++axis) {
         for (k = 0; k < DRIFT_FIELD; ++k) {
@@ -108,19 +99,9 @@ static inline void drift_update(drift_state *state) {
 static inline void drift_init(drift_state *state) {
     int k;
     state->begun = state->unseen = 0;
-    state->air_degC = state->camera_degC = state->settled_s = state->on_s = NAN;
-    for (k = 0; k < DRIFT_LAGS; ++k) state->ambient_lag[k] = state->camera_lag[k] = NAN;
-    for (k = 0; k <= DRIFT_PLAYS; ++k) state->plays[k] = NAN;
+    state->settled_s = state->on_s = NAN;
+    for (k = 0; k < DRIFT_VALUES; ++k) state->values[k] = NAN;
     drift_update(state);
-}
-
-/* What moves a play: the camera, or a part that follows air and camera late. */
-static inline double drift_push(const drift_state *state, int play) {
-    const int part = play - (DRIFT_PLAYS - DRIFT_PARTS);
-    double air_degC;
-    if (part < 0) return state->camera_degC;
-    air_degC = state->ambient_lag[drift_parts[part].lag];
-    return air_degC + drift_parts[part].share * (state->camera_lag[drift_parts[part].lag] - air_degC);
 }
 
 /* In equilibrium, with the part of its self-heating that the camera shows: a guess, unless it is as cold as the air
@@ -129,18 +110,14 @@ static inline void drift_begin(drift_state *state, double ambient_degC, double p
     const int known = drift_is_temperature(camera_degC);
     const double excess_K = known ? camera_degC - ambient_degC : 0.0;
     const int cold = known && fabs(excess_K) < DRIFT_COLD_K;
-    int k;
     state->begun = 1;
     state->unseen = power_on == 0.0 && !known;
     state->settled_s = cold ? HUGE_VAL : 0.0;
     state->on_s = cold || power_on == 0.0 ? 0.0 : HUGE_VAL;
-    state->air_degC = ambient_degC;
-    state->camera_degC = ambient_degC + excess_K;
-    for (k = 0; k < DRIFT_LAGS; ++k) {
-        state->ambient_lag[k] = ambient_degC;
-        state->camera_lag[k] = state->camera_degC;
-    }
-    for (k = 0; k <= DRIFT_PLAYS; ++k) state->plays[k] = drift_push(state, k);
+    state->values[0] = ambient_degC + excess_K;
+    state->values[1] = ambient_degC;
+    state->values[2] = cold ? 0.0 : drift_clip(excess_K / DRIFT_SELF_HEATING_K, 0.0, 1.0);
+    drift_rest(state->values);
 }
 
 /* dt_s have passed, with this mean temperature of the air near the camera and this share (0..1) of them powered; at
@@ -148,29 +125,22 @@ static inline void drift_begin(drift_state *state, double ambient_degC, double p
  * gap: what was remembered is lost. Returns the flags of the state. */
 static inline unsigned drift_advance(drift_state *state, double dt_s, double ambient_degC, double power_on,
                                      double camera_degC) {
-    double before_degC, excess_K, driver_degC;
-    int k;
+    double before_degC, excess_K, mean[DRIFT_VALUES];
     if (!(dt_s >= 0.0 && dt_s < HUGE_VAL && drift_is_temperature(ambient_degC) && power_on >= 0.0 && power_on <= 1.0)) {
         state->begun = 0;
-        state->camera_degC = drift_is_temperature(camera_degC) ? camera_degC : (double)NAN;
+        state->values[0] = drift_is_temperature(camera_degC) ? camera_degC : (double)NAN;
         drift_update(state);
         return state->flags;
     }
     if (!state->begun) drift_begin(state, ambient_degC, power_on, camera_degC);
-    before_degC = state->camera_degC;
-    excess_K = (before_degC - state->air_degC) * exp(-dt_s / DRIFT_UNPOWERED_TAU_S);
-    state->air_degC = ambient_degC;
-    state->camera_degC = drift_is_temperature(camera_degC) ? camera_degC : ambient_degC + excess_K;
-    driver_degC = (before_degC + state->camera_degC) / 2;
-    for (k = 0; k < DRIFT_LAGS; ++k) {
-        const double gained = -expm1(-dt_s / drift_taus_s[k]);
-        state->ambient_lag[k] += (ambient_degC - state->ambient_lag[k]) * gained;
-        state->camera_lag[k] += (driver_degC - state->camera_lag[k]) * gained;
-    }
-    for (k = 0; k < DRIFT_PLAYS; ++k) {
-        const double push_degC = drift_push(state, k);
-        state->plays[k] = drift_clip(state->plays[k], push_degC - drift_plays_K[k], push_degC + drift_plays_K[k]);
-    }
+    before_degC = state->values[0];
+    excess_K = (before_degC - state->values[1]) * exp(-dt_s / DRIFT_UNPOWERED_TAU_S);
+    state->values[0] = drift_is_temperature(camera_degC) ? camera_degC : ambient_degC + excess_K;
+    state->values[1] = ambient_degC;
+    state->values[2] = power_on;
+    memcpy(mean, state->values, sizeof mean);
+    mean[0] = (before_degC + state->values[0]) / 2;
+    drift_follow(state->values, mean, dt_s);
     if (state->unseen && drift_is_temperature(camera_degC)) {
         state->unseen = 0;
         if (fabs(camera_degC - ambient_degC) < DRIFT_COLD_K) state->settled_s = HUGE_VAL;

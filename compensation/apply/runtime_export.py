@@ -14,7 +14,6 @@ from thermostand.compensation.drift.between_nights import BetweenNights
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.drift.polynomial import exponents
-from thermostand.compensation.drift.terms import Kind, Term
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.history.states import Float
 from thermostand.foundation.files import make_folder, write_whole
@@ -70,20 +69,12 @@ def _left_px(model: DriftModel) -> Float:
             return model.discrepancy_px
 
 
-def _term(term: Term) -> list[str | float]:
-    """Its kind and parameter, of a part's play also the part's time constant and share."""
-    of_part = [term.tau_s, term.share] if term.kind is Kind.PART_PLAY else []
-    return [str(term.kind), term.parameter, *of_part]
-
-
 def _thermal(model: ThermalModel) -> dict[str, object]:
-    memory, valid = model.memory, model.valid
+    valid = model.valid
     return {
-        "terms": [_term(term) for term in model.terms],
-        "taus_s": memory.taus_s,
-        "plays_K": memory.plays_K,
-        "part_plays": memory.part_plays,
-        "self_heating_K": memory.self_heating_K,
+        "terms": [model.origin.bound(term.feature) for term in model.terms],
+        "ambient_tau_s": model.memory.ambient_lag[2],
+        "self_heating_K": model.self_heating_K,
         "reference_ambient_degC": model.reference_ambient_degC,
         "reference_features": model.reference_features.tolist(),
         "coefficients_px": model.coefficients.tolist(),

@@ -8,11 +8,13 @@ the night so far. Lags and plays are those of compensation/drift_runtime.py.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thermostand.compensation.drift_runtime import Follower
+from thermostand.compensation.expression import AIR, POWER, lag
 from thermostand.compensation.history.states import Float, Memory, States
 from thermostand.compensation.history.thermal_history import damped_least_squares, states_at
 from thermostand.compensation.observations import Observations
@@ -21,7 +23,7 @@ from thermostand.foundation.errors import SessionError
 
 STEP_S = 60.0
 _AIR_TAU_S = 300.0
-_CAMERA_TAUS_S = (150.0, 480.0, 1200.0, 4000.0)
+_AIR_LAGS, _POWER_LAGS = ([lag(of, tau_s) for tau_s in (150.0, 480.0, 1200.0, 4000.0)] for of in (AIR, POWER))
 _RIDGE = 1e-8
 _EVERY = 6
 """Of the camera's readings, for its fit: they come every few seconds, it moves within minutes."""
@@ -65,7 +67,7 @@ def together(parts: Sequence[Situation]) -> Situation:
     """The situations of all these, which remember the same; ValueError for none."""
     columns = [(part.target_degC, part.air_degC, part.camera_lags, part.states.rows) for part in parts]
     target, air, lags, rows = (np.concatenate(each) for each in zip(*columns, strict=True))
-    return Situation(target, air, lags, States.from_rows(parts[0].states.memory, rows))
+    return Situation(target, air, lags, States(parts[0].states.memory, rows))
 
 
 def surroundings(observations: Observations, ramp_K_per_min: float) -> Surroundings:
@@ -74,13 +76,13 @@ def surroundings(observations: Observations, ramp_K_per_min: float) -> Surroundi
     if history is None or not history.has_ambient or len(history.camera_ns) < 10 * _EVERY:
         raise SessionError("the session has no history of air and camera; nothing can be foreseen")
     at_ns, recorded_degC = history.camera_ns[::_EVERY], history.camera_degC[::_EVERY]
-    states = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, recorded_degC)
+    states = states_at(history, Memory((*_AIR_LAGS, *_POWER_LAGS)), at_ns, recorded_degC)
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
     # While it warms up the supply's lags explain it; of a camera that has been on for long they are 1.
-    terms = np.column_stack([np.ones(len(air)), air, states.ambient_lag_degC, states.power_lag - 1])
+    terms = np.column_stack([np.ones(len(air)), air, states.of(_AIR_LAGS), states.of(_POWER_LAGS) - 1])
     known = np.isfinite(terms).all(axis=1) & np.isfinite(recorded_degC)
     weights = damped_least_squares(terms[known], recorded_degC[known], _RIDGE)
-    return Surroundings(_air(observations), weights[: 2 + len(_CAMERA_TAUS_S)], ramp_K_per_min)
+    return Surroundings(_air(observations), weights[: 2 + len(_AIR_LAGS)], ramp_K_per_min)
 
 
 def _air(observations: Observations) -> Float:
@@ -98,7 +100,7 @@ def now(observations: Observations, memory: Memory) -> Situation:
     history = observations.histories[-1]
     own = observations.session == len(observations.sessions) - 1
     at_ns, recorded_degC = observations.time_ns[own][-1:], observations.camera_degC[own][-1:]
-    lags = states_at(history, Memory(_CAMERA_TAUS_S), at_ns, recorded_degC).ambient_lag_degC
+    lags = states_at(history, Memory(tuple(_AIR_LAGS)), at_ns, recorded_degC).of(_AIR_LAGS)
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
     return Situation(air, air, lags, states_at(history, memory, at_ns, recorded_degC))
 
@@ -106,68 +108,44 @@ def now(observations: Observations, memory: Memory) -> Situation:
 def at_rest(around: Surroundings, set_points_degC: Float, memory: Memory) -> Situation:
     """Of a powered camera after a long time at set-points (S,); plays are as after a way from a colder place."""
     air = around.air_degC(set_points_degC)
-    lags = np.repeat(air[:, None], len(_CAMERA_TAUS_S), axis=1)
-    camera = around.camera_degC(air, lags)
-    unknown = States.at_degC(camera, len(air), memory)
-    taus, count = len(memory.taus_s), len(air)
-    ambient_lag, camera_lag = (np.repeat(at[:, None], taus, axis=1) for at in (air, camera))
-    states = replace(
-        unknown,
-        ambient_lag_degC=ambient_lag,
-        power_lag=np.ones((count, taus)),
-        camera_lag_degC=camera_lag,
-        play_degC=_pushes(memory, camera, ambient_lag, camera_lag) - _radii_K(memory),
-        rate_K_per_h=np.zeros(count),
-        on_s=np.full(count, np.inf),
-        settled_s=np.full(count, np.inf),
-    )
-    return Situation(air, air, lags, states)
+    lags = np.repeat(air[:, None], len(_AIR_LAGS), axis=1)
+    follower = Follower(memory.parts)
+    values = follower.rest([around.camera_degC(air, lags), air, np.ones(len(air))])
+    for place, _, is_play, radius_K in follower.parts:
+        values[place] = values[place] - (radius_K if is_play else 0.0)
+    return Situation(air, air, lags, _states(memory, values))
 
 
-def _radii_K(memory: Memory) -> Float:
-    """(P,): of all plays."""
-    return np.array([*memory.plays_K, *(radius_K for _, _, radius_K in memory.part_plays)])
-
-
-def _pushes(memory: Memory, camera_degC: Float, ambient_lag_degC: Float, camera_lag_degC: Float) -> Float:
-    """(S, P): what moves each play, the camera or a part."""
-    lags = [memory.taus_s.index(tau_s) for tau_s, _, _ in memory.part_plays]
-    shares = np.array([share for _, share, _ in memory.part_plays])
-    of_air, of_camera = ambient_lag_degC[:, lags], camera_lag_degC[:, lags]
-    own = np.repeat(camera_degC[:, None], len(memory.plays_K), axis=1)
-    return np.hstack([own, of_air + shares * (of_camera - of_air)])
+def _states(memory: Memory, values: Sequence[Float]) -> States:
+    """Of a camera that has been on, and followed, for long."""
+    return States(memory, np.column_stack([*values, *np.full((2, len(values[0])), np.inf)]))
 
 
 def after(around: Surroundings, situation: Situation, set_points_degC: Float, dwell_s: Float) -> Situation:
     """After dwells (S,) at set-points (S,), s and degC."""
-    goal, before = around.air_degC(set_points_degC), situation.states
+    goal, memory = around.air_degC(set_points_degC), situation.states.memory
     left_s = np.asarray(dwell_s, np.float64).copy()
-    target, air, lags = situation.target_degC, situation.air_degC, situation.camera_lags
-    camera, ambient_lag, power_lag = before.camera_degC, before.ambient_lag_degC, before.power_lag
-    camera_lag, play = before.camera_lag_degC, before.play_degC
-    taus, radii = np.array(before.memory.taus_s), _radii_K(before.memory)
+    target, air, values = situation.target_degC, situation.air_degC, [*situation.states.columns]
+    of_air, of_model = Follower(_AIR_LAGS), Follower(memory.parts)
+    lags = [*situation.camera_lags.T]
+    on = np.ones(len(goal))
     for _ in range(int(np.ceil(left_s.max() / STEP_S))):
         dt = np.clip(left_s, 0.0, STEP_S)[:, None]
         left_s -= STEP_S
         reach_K = around.ramp_K_per_min / 60 * dt[:, 0]
         target = target + np.clip(goal - target, -reach_K, reach_K)
-        before_air, before_camera = air, camera
+        before_air, before_camera = air, values[0]
         air = air + (target - air) * -np.expm1(-dt[:, 0] / _AIR_TAU_S)
-        mean_air = ((air + before_air) / 2)[:, None]
-        lags = lags + (mean_air - lags) * -np.expm1(-dt / np.array(_CAMERA_TAUS_S))
-        camera = np.where(dt[:, 0] > 0, around.camera_degC(air, lags), before_camera)
-        gained = -np.expm1(-dt / taus)
-        ambient_lag = ambient_lag + (mean_air - ambient_lag) * gained
-        power_lag = power_lag + (1 - power_lag) * gained
-        camera_lag = camera_lag + (((camera + before_camera) / 2)[:, None] - camera_lag) * gained
-        pushes = _pushes(before.memory, camera, ambient_lag, camera_lag)
-        play = np.clip(play, pushes - radii, pushes + radii)
-    states = replace(
-        before,
-        camera_degC=camera,
-        ambient_lag_degC=ambient_lag,
-        power_lag=power_lag,
-        camera_lag_degC=camera_lag,
-        play_degC=play,
-    )
-    return Situation(target, air, lags, states)
+        mean_air = (air + before_air) / 2
+        inputs = [before_camera, mean_air, on]
+        _, _, _, *lags = _moved(of_air, [*inputs, *lags], inputs, dt)
+        camera = np.where(dt[:, 0] > 0, around.camera_degC(air, np.column_stack(lags)), before_camera)
+        mean = [(camera + before_camera) / 2, mean_air, on]
+        values = _moved(of_model, [camera, mean_air, on, *values[3:]], mean, dt)
+    return Situation(target, air, np.column_stack(lags), _states(memory, values))
+
+
+def _moved(follower: Follower, now: list[Float], mean: list[Float], dt_s: Float) -> list[Float]:
+    """After dt_s (S, 1), with these inputs now and in the mean."""
+    follower.follow(now, [*mean, *now[3:]], (-np.expm1(-dt_s / follower.taus_s)).T, np.clip)
+    return now

@@ -19,7 +19,7 @@ from thermostand.compensation.design.courses import Known, best_course
 from thermostand.compensation.design.forecast import Situation, now, surroundings
 from thermostand.compensation.design.wanted_states import wanted_states
 from thermostand.compensation.drift.candidates import FEWEST_BETWEEN
-from thermostand.compensation.drift.terms import Origin, features
+from thermostand.compensation.drift.terms import features
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.history.states import Float
@@ -130,5 +130,5 @@ def _furthest(observations: Observations, wanted: Wanted, grid: Float, why: str)
 
 
 def _features(model: ThermalModel, situation: Situation) -> Float:
-    origin = Origin(model.facts.reference_degC, model.reference_ambient_degC)
-    return features(situation.states, model.terms, origin) - model.reference_features
+    found = features(situation.states, [term.feature for term in model.terms], model.origin)
+    return found - model.reference_features

@@ -16,7 +16,7 @@ from thermostand.compensation.drift.condensed import condense_instants
 from thermostand.compensation.drift.displacements import Displacements, displacements_from
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import check_same
-from thermostand.compensation.drift.terms import MOTIONS, Kind, Origin, features
+from thermostand.compensation.drift.terms import MOTIONS, Constant, features
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.history.states import Float
@@ -44,8 +44,7 @@ def anchored(model: DriftModel, observations: Observations, frames: Mask | None 
         raise SessionError(f"a model is anchored in one session of its target, {model.facts.target_name}")
     wanted = observations.of(Role.REFERENCE) if frames is None else frames & observations.usable
     states = frame_states(observations, thermal.memory)
-    origin = Origin(thermal.facts.reference_degC, thermal.reference_ambient_degC)
-    found = features(states, thermal.terms, origin) - thermal.reference_features
+    found = features(states, [term.feature for term in thermal.terms], thermal.origin) - thermal.reference_features
     # Against where the model's first night had them at the reference.
     known = wanted & np.isfinite(found).all(axis=1)
     rows = displacements_from(observations, known, thermal.facts.reference_centres_px)
@@ -73,7 +72,7 @@ def _updated(model: ThermalModel, observations: Observations, rows: Displacement
     if len(seen.amounts_px) == 0:
         raise SessionError("the markers of the session's reference frames do not determine how the image has moved")
     coefficients, covariance = model.coefficients.copy(), model.coefficient_covariance.copy()
-    constant = [term.kind is Kind.CONSTANT for term in model.terms].index(True)
+    constant = [isinstance(term, Constant) for term in model.terms].index(True)
     covariance[:, constant, constant] += _UNKNOWN_PX**2
     feature, seen_px = seen.features.mean(axis=0), seen.amounts_px.mean(axis=0)
     noise_px2 = seen.variance_px2.mean(axis=0) / len(seen.amounts_px)

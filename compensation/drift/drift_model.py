@@ -102,7 +102,7 @@ def states_of(state: Situation, count: int, memory: Memory) -> States:
     """One state for each of `count` points. ValueError when there are more or fewer, or a temperature alone is given to
     a form that remembers."""
     if not isinstance(state, States):
-        if memory.taus_s or memory.plays:
+        if memory.parts:
             raise ValueError(
                 "a model of the form thermal follows the camera's past, and its temperature alone does not say it: "
                 "give thermostand.states(model, session), or of arrays; model.other is the paper's form, if it has one"

@@ -1,18 +1,19 @@
 """Drift models as JSON files: every number with its unit, arrays as nested lists, a marker never seen as null.
 
-A file holds the form in use and, as `other`, the one that was not chosen. From 0.2.0 on formats are kept: each version
-of the program reads the files of all before it. Those of versions before 9 are of unreleased versions and are not read.
+A file holds the form in use and, as `other`, the one that was not chosen. From 0.2.0 on formats are kept: each
+version of the program reads the files of all before it. Those of versions before 10 are of unreleased versions and are
+not read.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, TypeAdapter, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, TypeAdapter
 
 from thermostand.compensation.drift.between_nights import BetweenNights
 from thermostand.compensation.drift.bump import Bump
@@ -22,7 +23,7 @@ from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.hull import is_area
 from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
 from thermostand.compensation.drift.polynomial import exponents
-from thermostand.compensation.drift.terms import MOTIONS, TERMS, Kind, Term
+from thermostand.compensation.drift.terms import MOTIONS, Term, term_of
 from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange
 from thermostand.compensation.drift_runtime import HOTTEST_degC
 from thermostand.compensation.sound_values import (
@@ -40,16 +41,13 @@ from thermostand.foundation.documents import Document, load_json
 from thermostand.foundation.files import write_whole
 
 FORMAT = "thermostand drift model"
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 
 _FACTS = (
     *("software_version", "camera_serial", "session_ids", "target_name", "camera_range_degC", "reference_degC"),
     *("reference_chamber_degC", "bumps"),
 )
 """Fields of ModelFacts that a file has as they are."""
-_FITTED = {term.kind for term in TERMS}
-_REMEMBERS_NOTHING = (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE, Kind.PLAY)
-_LONGEST_S = 1e9
 Spread = tuple[NotNegative, NotNegative]
 Range = tuple[Degrees, Degrees]
 Rows = tuple[tuple[float, ...], ...]
@@ -95,22 +93,12 @@ class PaperFile(_File):
     other: ThermalFile | None = None
 
 
-class TermFile(Document):
-    """A term; the parameter is a time constant, s, or the radius of a play, K. tau_s, share: of a part's play."""
+def _written(term: Term) -> dict[str, object]:
+    """Its kind and parameters, as terms.term_of takes them."""
+    return {"kind": term.kind, **term.model_dump()}
 
-    kind: Kind
-    parameter: Annotated[float, Field(ge=0, le=_LONGEST_S)]
-    tau_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 0.0
-    share: Annotated[float, Field(ge=0, le=1)] = 0.0
 
-    @model_validator(mode="after")
-    def _has_time(self) -> TermFile:
-        if self.kind not in _FITTED:
-            raise ValueError(f"no model has a {self.kind}")
-        tau_s = self.tau_s if self.kind is Kind.PART_PLAY else self.parameter
-        if tau_s == 0 and self.kind not in _REMEMBERS_NOTHING:
-            raise ValueError(f"a {self.kind} has a time constant above 0")
-        return self
+_Term = Annotated[Term, BeforeValidator(term_of), PlainSerializer(_written)]
 
 
 class ThermalFile(_File):
@@ -119,7 +107,7 @@ class ThermalFile(_File):
     was not fitted adds, null where that is not known; with nights_compared 0 it was assumed, not measured."""
 
     form: Literal["thermal"] = "thermal"
-    terms: tuple[TermFile, ...]
+    terms: tuple[_Term, ...]
     reference_ambient_degC: Degrees
     reference_features: tuple[float, ...]
     self_heating_K: Annotated[float, Field(gt=0, le=HOTTEST_degC)]
@@ -197,7 +185,7 @@ def _paper_fields(model: PaperModel) -> dict[str, object]:
 
 def _thermal_fields(model: ThermalModel) -> dict[str, object]:
     return {
-        "terms": [asdict(term) for term in model.terms],
+        "terms": model.terms,
         "reference_ambient_degC": model.reference_ambient_degC,
         "reference_features": model.reference_features.tolist(),
         "self_heating_K": model.self_heating_K,
@@ -255,7 +243,7 @@ def _thermal(file: ThermalFile) -> ThermalModel:
     check_order("ambient_range_degC", file.ambient_range_degC)
     return ThermalModel(
         facts=_facts(file),
-        terms=tuple(Term(term.kind, term.parameter, term.tau_s, term.share) for term in file.terms),
+        terms=file.terms,
         reference_ambient_degC=file.reference_ambient_degC,
         self_heating_K=file.self_heating_K,
         reference_features=reference_features,

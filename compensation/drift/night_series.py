@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from thermostand.compensation.drift.bump import MOTIONS
 from thermostand.compensation.drift.displacements import Displacements, anchors, displacements
-from thermostand.compensation.drift.terms import Kind, Origin, Term, features, motions
+from thermostand.compensation.drift.terms import features, motions
 from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift_runtime import remembered
+from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, lag, play
 from thermostand.compensation.history.states import Float, Memory
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
@@ -21,14 +23,14 @@ Index = NDArray[np.int64]
 _ROLES = (Role.WARM_UP, Role.REFERENCE, Role.FIT, Role.VALIDATION)
 _TAUS_S = (480.0, 1620.0, 6000.0, 18000.0)
 _PLAYS_K = (1.5, 3.0, 6.0, 10.0, 14.0)
-_TERMS = (
-    Term(Kind.CAMERA),
-    Term(Kind.CAMERA_SQUARE),
-    *(Term(Kind.AMBIENT_LAG, tau_s) for tau_s in _TAUS_S),
-    *(Term(Kind.POWER_LAG, tau_s) for tau_s in _TAUS_S),
-    Term(Kind.CAMERA_LAG, _TAUS_S[1]),
-    Term(Kind.CAMERA_LAG_SQUARE, _TAUS_S[1]),
-    *(Term(Kind.PLAY, radius_K) for radius_K in _PLAYS_K),
+_FEATURES = (
+    away(CAMERA),
+    away(CAMERA) ** 2,
+    *(away(lag(AIR, tau_s)) for tau_s in _TAUS_S),
+    *(lag(POWER, tau_s) - 1 for tau_s in _TAUS_S),
+    away(lag(CAMERA, _TAUS_S[1])),
+    away(lag(CAMERA, _TAUS_S[1])) ** 2,
+    *(away(play(CAMERA, radius_K)) for radius_K in _PLAYS_K),
 )
 _FORGOTTEN_S = (900.0, 3600.0, 14400.0)
 """How what was before the record fades, when nobody knows it."""
@@ -132,11 +134,11 @@ def _condensed(session_id: str, frames: _Frames) -> NightSeries:
 
 def _features(observations: Observations) -> tuple[Float, Mask]:
     """(F, H) of all frames, and which are known (F,): none without a history of the air, where lag looks like steps."""
-    states = frame_states(observations, Memory(_TAUS_S, _PLAYS_K))
+    states = frame_states(observations, Memory(remembered(_FEATURES)))
     if not np.isfinite(observations.air_degC).any():
         return np.empty((len(observations.frame), 0)), np.zeros(len(observations.frame), bool)
     origin = Origin(float(np.nanmean(states.camera_degC)), float(np.nanmean(observations.air_degC)))
-    found = features(states, _TERMS, origin)
+    found = features(states, _FEATURES, origin)
     fading = np.exp(-states.settled_s[:, None] / np.array(_FORGOTTEN_S))
     return np.hstack([found, fading]), np.isfinite(found).all(axis=1) & ~(states.on_s < _QUICK_S)
 

@@ -1,143 +1,256 @@
 """The terms of the thermal model: how a homography moves points, times what the camera's thermal state makes of it.
 
 A displacement field is a sum over the eight infinitesimal motions of a homography (shift, affine, perspective), each
-with an amount that is linear in the features of the thermal state.
+with an amount that is linear in the features of the thermal state. Each kind of feature is described once, by its
+class; another package adds one by a subclass of Term, which an entry point of the group `thermostand.drift_terms`
+names.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import StrEnum
+from collections.abc import Mapping, Sequence
+from importlib.metadata import EntryPoint, entry_points
 from itertools import product
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
+from pydantic import Field, ValidationError
 
+from thermostand.compensation.drift_runtime import compiled, remembered
+from thermostand.compensation.expression import AIR, CAMERA, Expression, Feature, Origin, away, in_words, lag, play
 from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError
 
+GROUP = "thermostand.drift_terms"
 MOTIONS = 8
 _QUICK_S = 240.0
-_SPAN_K = 20.0
-"""Temperatures are scaled by this, so that all features are about 1."""
-
-
-class Kind(StrEnum):
-    """What a term is made of. CAMERA_LAG: what follows the camera's own temperature, as a lens does. POWER_LAG,
-    CAMERA_LAG_SQUARE: of night_series.py, in no model. PART_PLAY: of a part between air and camera that nobody
-    measures, as a mount."""
-
-    CONSTANT = "constant"
-    CAMERA = "camera"
-    CAMERA_SQUARE = "camera squared"
-    AMBIENT_LAG = "ambient lag"
-    AMBIENT_LAG_SQUARE = "ambient lag squared"
-    AMBIENT_LAG_CUBE = "ambient lag cubed"
-    POWER_LAG = "power lag"
-    CAMERA_LAG = "camera lag"
-    CAMERA_LAG_SQUARE = "camera lag squared"
-    PLAY = "play"
-    PART_PLAY = "part play"
-
-
-@dataclass(frozen=True, slots=True)
-class Term:
-    """One feature. parameter: time constant of a lag, s, or radius of a play, K; 0 for the others. tau_s, share: of the
-    part in a part's play, how late it follows and its share of the camera's excess over the air."""
-
-    kind: Kind
-    parameter: float = 0.0
-    tau_s: float = 0.0
-    share: float = 0.0
-
-
-TAUS_S = tuple(60.0 * minutes for minutes in (4, 8, 15, 27, 50, 100, 210, 450))
-"""The slowest are for what creeps, and for a night that begins before all is warm; lags between two of these are sums
-of them."""
-
-SLOW_S = 12600.0
+_SLOW_S = 12600.0
 """Lags from here on are slower than a camera warms: of what creeps, which most cameras have little of."""
 
-_BENT, _BENT_S = (Kind.AMBIENT_LAG_SQUARE, Kind.AMBIENT_LAG_CUBE), (480.0, 1620.0, 6000.0)
+Tau_s = Annotated[float, Field(gt=0, le=1e9)]
+Radius_K = Annotated[float, Field(gt=0, le=1e3)]
+Share = Annotated[float, Field(ge=0, le=1)]
 
-PLAYS_K = (3.0, 6.0, 10.0, 14.0)
-
-PART_PLAYS = tuple(product((480.0, 1620.0, 3000.0), (0.1, 0.3), (1.0, 2.0, 4.0)))
-"""Time constants, shares and radii. A dead zone in a mount moves the image by where the mount came from, which is no
-play of the chip's temperature: switching on heats the chip by 15 K and the mount by 3."""
-
-TERMS = (
-    Term(Kind.CONSTANT),
-    Term(Kind.CAMERA),
-    Term(Kind.CAMERA_SQUARE),
-    *(Term(kind, tau_s) for kind in (Kind.AMBIENT_LAG, Kind.CAMERA_LAG) for tau_s in TAUS_S),
-    *(Term(kind, tau_s) for kind in _BENT for tau_s in _BENT_S),
-    *(Term(Kind.PLAY, radius_K) for radius_K in PLAYS_K),
-    *(Term(Kind.PART_PLAY, radius_K, tau_s, share) for tau_s, share, radius_K in PART_PLAYS),
-)
-"""What a camera may be moved by. Its own temperature brings its self-heating with it: with lags of the supply, a
-warm-up in other air is predicted worse. Higher powers follow the air: a camera that is switched on cold is at
-temperatures of its own that a warm one reaches in much colder air only, and powers of these would extrapolate there."""
+TERMS: dict[str, type[Term]] = {}
+"""Every kind of term that is known, by its name, in the order of a fit's features."""
 
 
-def width_group(term: Term) -> tuple[Kind, bool]:
-    """Terms of one group have coefficients of one size: those of a kind, slow lags by themselves, and what bends."""
-    slow = term.kind in (Kind.AMBIENT_LAG, Kind.CAMERA_LAG) and term.parameter >= SLOW_S
-    return _BENT[0] if term.kind in _BENT else term.kind, slow
+class Term(Document):
+    """A feature of the drift, and all that is to be said of its kind; fields are its parameters, with units.
+
+    kind: its name in model files. title: its name in a model's, where the first field's range stands behind it.
+    """
+
+    kind: ClassVar[str]
+    title: ClassVar[str] = ""
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **given: Any) -> None:
+        if "kind" not in vars(cls):
+            raise TypeError(f"{cls.__name__} is a term and has to state its kind")
+        cls.title = vars(cls).get("title", cls.kind)
+        TERMS[cls.kind] = cls
+
+    @property
+    def feature(self) -> Feature:
+        """What it is of the thermal state: near 0 in equilibrium at the reference, and about 1 where it is large."""
+        raise NotImplementedError
+
+    @property
+    def width(self) -> str:
+        """Terms of one width have coefficients of one size."""
+        return self.kind
+
+    @property
+    def symbol(self) -> str:
+        """Its feature in a formula."""
+        return in_words(self.feature)
+
+    @classmethod
+    def usual(cls) -> Sequence[Term]:
+        """Those that every fit has; the night says how much each counts."""
+        return (cls(),)
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Temperatures at the reference: of the camera and of the air near it."""
+class Constant(Term):
+    """The misfit at the reference."""
 
-    camera_degC: float
-    ambient_degC: float
+    kind = "constant"
+
+    @property
+    def feature(self) -> Feature:
+        return 1.0
 
 
-def memory_of(terms: tuple[Term, ...], self_heating_K: float) -> Memory:
-    """What the terms need remembered, and one lag of the ambient in any case: its range is part of where a model holds,
+class OfCamera(Term):
+    """The camera's own temperature, which brings its self-heating with it: with lags of the supply instead, a warm-up
+    in other air is predicted worse."""
+
+    kind = "camera"
+
+    @property
+    def feature(self) -> Feature:
+        return away(CAMERA)
+
+
+class OfCameraSquared(Term):
+    """Its square."""
+
+    kind = "camera squared"
+
+    @property
+    def feature(self) -> Feature:
+        return away(CAMERA) ** 2
+
+
+class AmbientLag(Term):
+    """A part that follows the air late."""
+
+    kind = "ambient lag"
+    of: ClassVar[Expression] = AIR
+    tau_s: Tau_s
+
+    @property
+    def feature(self) -> Feature:
+        return away(lag(self.of, self.tau_s))
+
+    @property
+    def width(self) -> str:
+        return f"{self.kind}, slow" if self.tau_s >= _SLOW_S else self.kind
+
+    @classmethod
+    def usual(cls) -> Sequence[Term]:
+        """The slowest are for what creeps, and for a night that begins before all is warm; lags between two of these
+        are sums of them."""
+        return tuple(cls(tau_s=60.0 * minutes) for minutes in (4, 8, 15, 27, 50, 100, 210, 450))
+
+
+class CameraLag(AmbientLag):
+    """A part that follows the camera's own temperature late, as a lens does."""
+
+    kind = "camera lag"
+    of = CAMERA
+
+
+class AmbientLagSquared(Term):
+    """Higher powers follow the air: a camera that is switched on cold is at temperatures of its own that a warm one
+    reaches in much colder air only, and powers of these would extrapolate there."""
+
+    kind = "ambient lag squared"
+    power: ClassVar[int] = 2
+    tau_s: Tau_s
+
+    @property
+    def feature(self) -> Feature:
+        return away(lag(AIR, self.tau_s)) ** self.power
+
+    @property
+    def width(self) -> str:
+        return "ambient lag bent"
+
+    @classmethod
+    def usual(cls) -> Sequence[Term]:
+        return tuple(cls(tau_s=tau_s) for tau_s in (480.0, 1620.0, 6000.0))
+
+
+class AmbientLagCubed(AmbientLagSquared):
+    """The cube of a lag of the air."""
+
+    kind = "ambient lag cubed"
+    power = 3
+
+
+class OfPlay(Term):
+    """A dead zone in what follows the camera's temperature."""
+
+    kind = "play"
+    title = "plays"
+    radius_K: Radius_K
+
+    @property
+    def feature(self) -> Feature:
+        return away(play(CAMERA, self.radius_K))
+
+    @classmethod
+    def usual(cls) -> Sequence[Term]:
+        return tuple(cls(radius_K=radius_K) for radius_K in (3.0, 6.0, 10.0, 14.0))
+
+
+class OfPartPlay(Term):
+    """Of a part between air and camera that nobody measures, as a mount: it follows both late, and has a share of the
+    camera's excess over the air. A dead zone in a mount moves the image by where the mount came from, which is no play
+    of the chip's temperature: switching on heats the chip by 15 K and the mount by 3."""
+
+    kind = "part play"
+    title = "plays of parts"
+    radius_K: Radius_K
+    tau_s: Tau_s
+    share: Share
+
+    @property
+    def feature(self) -> Feature:
+        air, camera = lag(AIR, self.tau_s), lag(CAMERA, self.tau_s)
+        return away(play(air + self.share * (camera - air), self.radius_K))
+
+    @property
+    def symbol(self) -> str:
+        return f"play({self.radius_K:g} K, {self.tau_s / 60:g} min, {self.share:g})"
+
+    @classmethod
+    def usual(cls) -> Sequence[Term]:
+        parts = product((480.0, 1620.0, 3000.0), (0.1, 0.3), (1.0, 2.0, 4.0))
+        return tuple(cls(radius_K=radius_K, tau_s=tau_s, share=share) for tau_s, share, radius_K in parts)
+
+
+def usual_terms() -> tuple[Term, ...]:
+    """What a camera may be moved by: the terms of a fit. ConfigError where a package's cannot be loaded."""
+    for point in entry_points(group=GROUP):
+        _load(point)
+    return tuple(term for kind in TERMS.values() for term in kind.usual())
+
+
+def _load(point: EntryPoint) -> None:
+    try:
+        point.load()
+    except Exception as error:  # importing a stranger's module may raise anything
+        package = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
+        raise ConfigError(f"{point.name}: {package} cannot be loaded ({error}); reinstall it") from error
+
+
+def term_of(value: object) -> Term:
+    """The term of a model file; ValueError when there is none such."""
+    if isinstance(value, Term):
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError("not a term: give its kind and parameters")
+    given = dict(cast("Mapping[str, Any]", value))
+    kind = given.pop("kind", None)
+    if kind not in TERMS:
+        for point in entry_points(group=GROUP, name=str(kind)):
+            _load(point)
+    if kind not in TERMS:
+        raise ValueError(f"no model has a {kind}; there are {', '.join(TERMS)}")
+    try:
+        return TERMS[kind].model_validate(given)
+    except ValidationError as error:
+        raise ValueError("; ".join(f"{path_text(each['loc'])}: {each['msg']}" for each in error.errors())) from error
+
+
+def memory_of(terms: Sequence[Term], self_heating_K: float) -> Memory:
+    """What the terms need remembered, and a lag of the ambient in any case: its range is part of where a model holds,
     also where a warm-up has shown the camera at every temperature."""
-    plays = {term.parameter for term in terms if term.kind is Kind.PLAY}
-    parts = [(term.tau_s, term.share, term.parameter) for term in terms if term.kind is Kind.PART_PLAY]
-    of_lags = {term.parameter for term in terms if term.kind not in (Kind.PLAY, Kind.PART_PLAY) and term.parameter > 0}
-    taus = of_lags | {tau_s for tau_s, _, _ in parts} or {_QUICK_S}
-    return Memory(tuple(sorted(taus)), tuple(sorted(plays)), self_heating_K, tuple(sorted(parts)))
+    parts = remembered([term.feature for term in terms])
+    quickest = () if any(part[:2] == ("lag", AIR) for part in parts) else (lag(AIR, _QUICK_S),)
+    return Memory((*parts, *quickest), self_heating_K)
 
 
-def power_of(kind: Kind) -> int:
-    """Of a lag or temperature in a term."""
-    return 2 if kind.endswith(" squared") else 3 if kind.endswith(" cubed") else 1
-
-
-def features(states: States, terms: tuple[Term, ...], origin: Origin) -> Float:
-    """(F, H) of F instants and H terms; all but the constant are near 0 in equilibrium at the reference."""
-    return np.stack([_feature(states, term, origin) for term in terms], axis=1)
-
-
-def _feature(states: States, term: Term, origin: Origin) -> Float:
-    memory = states.memory
-    own = (states.camera_degC - origin.camera_degC) / _SPAN_K
-    match term.kind:
-        case Kind.CONSTANT:
-            return np.ones_like(own)
-        case Kind.CAMERA:
-            return own
-        case Kind.CAMERA_SQUARE:
-            return own**2
-        case Kind.AMBIENT_LAG | Kind.AMBIENT_LAG_SQUARE | Kind.AMBIENT_LAG_CUBE:
-            lag = states.ambient_lag_degC[:, memory.taus_s.index(term.parameter)]
-            return ((lag - origin.ambient_degC) / _SPAN_K) ** power_of(term.kind)
-        case Kind.POWER_LAG:
-            return states.power_lag[:, memory.taus_s.index(term.parameter)] - 1
-        case Kind.CAMERA_LAG | Kind.CAMERA_LAG_SQUARE:
-            lag = states.camera_lag_degC[:, memory.taus_s.index(term.parameter)]
-            return ((lag - origin.camera_degC) / _SPAN_K) ** power_of(term.kind)
-        case Kind.PLAY:
-            play = states.play_degC[:, memory.plays_K.index(term.parameter)]
-            return (play - origin.camera_degC) / _SPAN_K
-        case Kind.PART_PLAY:
-            part = memory.part_plays.index((term.tau_s, term.share, term.parameter))
-            play = states.play_degC[:, len(memory.plays_K) + part]
-            at_origin = origin.ambient_degC + term.share * (origin.camera_degC - origin.ambient_degC)
-            return (play - at_origin) / _SPAN_K
+def features(states: States, these: Sequence[Feature], origin: Origin) -> Float:
+    """(F, H) of F instants and H features; all but the constant are near 0 in equilibrium at the reference."""
+    count, columns = len(states.camera_degC), states.columns
+    values = [compiled(origin.bound(one), states.memory.at)(columns) for one in these]
+    return np.stack([np.broadcast_to(np.asarray(one, np.float64), count) for one in values], axis=1)
 
 
 def motions(xy_px: Float, image_size: tuple[int, int]) -> Float:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from thermostand.compensation.drift.condensed import Index, Instants
-from thermostand.compensation.drift.terms import MOTIONS, Term, width_group
+from thermostand.compensation.drift.terms import MOTIONS, Term
 from thermostand.compensation.history.states import Float
 
 _WANDERS, _WANDER_TAUS_S = (1.0, 2.0, 4.0), (1800.0, 7200.0)
@@ -96,8 +96,8 @@ class Learned:
 
 def learn(instants: Instants, terms: Sequence[Term]) -> Learned:
     """The most likely prior and noise of each motion, and what they make of these instants."""
-    groups = list(dict.fromkeys(width_group(term) for term in terms))
-    group = np.array([groups.index(width_group(term)) for term in terms])
+    groups = list(dict.fromkeys(term.width for term in terms))
+    group = np.array([groups.index(term.width) for term in terms])
     scale_px = np.sqrt(np.median(instants.variance_px2, axis=0))
     amounts = instants.amounts_px / scale_px
     best: list[tuple[float, Float, _Weighting] | None] = [None] * MOTIONS

@@ -13,21 +13,21 @@ from thermostand.compensation.drift.between_nights import between_nights
 from thermostand.compensation.drift.candidates import Candidate, discrepancy_px, fold_means, moving_rms_px, pair_of
 from thermostand.compensation.drift.displacements import Displacements
 from thermostand.compensation.drift.facts import facts_of
-from thermostand.compensation.drift.terms import MOTIONS, PART_PLAYS, PLAYS_K, TAUS_S, TERMS, Kind, motions
+from thermostand.compensation.drift.terms import MOTIONS, memory_of, motions, usual_terms
 from thermostand.compensation.drift.thermal_fit import Learned, learn
 from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange, form_name
 from thermostand.compensation.drift.training import Training, self_heating_K, training
-from thermostand.compensation.drift_runtime import SETTLED_TAUS
-from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.drift_runtime import SETTLED_TAUS, Follower, compiled
+from thermostand.compensation.history.states import Float
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
 
 _FEWEST_FOLDS = 3
 _MOST_OF = 0.8
-_GUESSED = 0.25
-"""How wrong the first guess of a feature may be, 5 K of 20: of where the camera has been, and of its self-heating."""
-_OF_PLACE, _OF_HEATING = (Kind.AMBIENT_LAG, Kind.CAMERA_LAG), (Kind.CAMERA_LAG,)
+_GUESSED_K = 5.0
+"""How wrong the first guess may be: of where the camera has been, and of its self-heating."""
+_TINY = 1e-20
 _LEAST_PX, _STEP_S = 0.003, 300.0
 _DOUBT = 4.0
 """The jackknife over the set-points of one night sees a part of what another night brings: its variance counts so many
@@ -48,8 +48,9 @@ class _Taught:
 
 def fit_thermal(observations: Observations) -> ThermalModel:
     """The model of the REFERENCE, FIT and WARM_UP frames; SessionError when the sessions cannot support it."""
-    memory = Memory(TAUS_S, PLAYS_K, self_heating_K(observations), PART_PLAYS)
-    return _model(_taught(training(observations, TERMS, memory)), memory.self_heating_K)
+    terms = usual_terms()
+    memory = memory_of(terms, self_heating_K(observations))
+    return _model(_taught(training(observations, terms, memory)), memory.self_heating_K)
 
 
 def left_out_thermal(model: ThermalModel, observations: Observations) -> tuple[Displacements, Float]:
@@ -157,21 +158,34 @@ def _history_s(model: ThermalModel) -> float:
     is wrong by the same for all lags."""
     limit_px = max(float(np.hypot(*model.discrepancy_px)), _LEAST_PX)
     moved = motions(model.facts.hull_px, model.facts.image_size)
-    taus_s = np.array([term.parameter for term in model.terms])
-    guesses = [np.array([term.kind in kinds for term in model.terms]) for kinds in (_OF_PLACE, _OF_HEATING)]
-    longest_s = SETTLED_TAUS * max(model.memory.taus_s, default=0.0)
+    guesses = [_guessed(model, np.array(wrong_K)) for wrong_K in ((_GUESSED_K, _GUESSED_K), (_GUESSED_K, 0.0))]
+    longest_s = SETTLED_TAUS * model.memory.longest_s
     for after_s in np.arange(0.0, longest_s, _STEP_S).tolist():
-        left = [_GUESSED * model.coefficients[:, own] @ np.exp(-after_s / taus_s[own]) for own in guesses]
+        left = [model.coefficients @ wrong @ np.exp(-after_s / taus_s) for wrong, taus_s in guesses]
         if math.hypot(*(float(np.linalg.norm(moved @ amounts, axis=1).mean()) for amounts in left)) < limit_px:
             return float(after_s)
     return float(longest_s)
+
+
+def _guessed(model: ThermalModel, wrong_K: Float) -> tuple[Float, Float]:
+    """(H, L): how wrong the features are at the reference, to first order, by each of L lags when a state was guessed
+    with the camera and the air wrong by so much; and how slowly each lag forgets it (L,)."""
+    follower = Follower(model.memory.parts)
+    inputs = np.array([model.origin.camera_degC, model.origin.ambient_degC]) + 1j * _TINY * wrong_K
+    rest = np.array(follower.rest([*inputs, 1.0]))  # a derivative is the imaginary part by a tiny imaginary step
+    lags = [place for place, _, is_play, _ in follower.parts if not is_play]
+    values = np.repeat(rest.real[:, None].astype(complex), len(lags), axis=1)
+    values[lags, np.arange(len(lags))] += 1j * rest.imag[lags]
+    zero = np.zeros(len(lags))
+    found = [compiled(model.origin.bound(term.feature), follower.at)(values) + zero for term in model.terms]
+    return np.imag(found) / _TINY, follower.taus_s
 
 
 def _range(trained: Training) -> ThermalRange:
     """What the training frames covered; the quickest lag stands for the ambient."""
     states = trained.states.where(np.unique(trained.rows.frame))
     return ThermalRange(
-        ambient_degC=_extent(states.ambient_lag_degC[:, 0]),
+        ambient_degC=_extent(states.of([states.memory.ambient_lag])),
         least_on_s=float(states.on_s.min()),
     )
 

@@ -8,7 +8,7 @@ compensation/drift/thermal_learning.py makes the model.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +24,9 @@ from thermostand.compensation.drift.drift_model import (
     range_flags,
     states_of,
 )
-from thermostand.compensation.drift.terms import Kind, Origin, Term, features, memory_of, motions
-from thermostand.compensation.drift_runtime import SETTLED_TAUS
+from thermostand.compensation.drift.terms import TERMS, Term, features, memory_of, motions
+from thermostand.compensation.drift_runtime import SETTLED_TAUS, remembered
+from thermostand.compensation.expression import Origin
 from thermostand.compensation.history.states import Float, Memory, States
 
 _MORE_LEVERAGE = 3.0
@@ -81,6 +82,11 @@ class ThermalModel(DriftModel):
         """What has to be remembered for it."""
         return memory_of(self.terms, self.self_heating_K)
 
+    @property
+    def origin(self) -> Origin:
+        """Temperatures at the reference."""
+        return Origin(self.facts.reference_degC, self.reference_ambient_degC)
+
     def shift(self, xy_px: Float, state: Situation) -> Float:
         """As in DriftModel."""
         amounts = self._features(state, len(xy_px)) @ self.coefficients.T
@@ -113,7 +119,7 @@ class ThermalModel(DriftModel):
     @property
     def history_s(self) -> float:
         """How long a camera must be followed after a guess of its state."""
-        longest_s = SETTLED_TAUS * max(self.memory.taus_s, default=0.0)
+        longest_s = SETTLED_TAUS * self.memory.longest_s
         return longest_s if self.valid.history_s is None else min(self.valid.history_s, longest_s)
 
     def leverage(self, state: States) -> Float:
@@ -124,15 +130,14 @@ class ThermalModel(DriftModel):
 
     def _features(self, state: Situation, count: int) -> Float:
         states = states_of(state, count, self.memory)
-        origin = Origin(self.facts.reference_degC, self.reference_ambient_degC)
-        return features(states, self.terms, origin) - self.reference_features
+        return features(states, [term.feature for term in self.terms], self.origin) - self.reference_features
 
     def _state_flags(self, states: States) -> Flags:
         valid = self.valid
         found = range_flags(states.camera_degC, _widened(self.facts.camera_range_degC), Outside.CAMERA)
         found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
-        if self.memory.taus_s:
-            found |= range_flags(states.ambient_lag_degC[:, 0], _widened(valid.ambient_degC), Outside.AMBIENT)
+        (ambient_degC,) = states.of([self.memory.ambient_lag]).T
+        found |= range_flags(ambient_degC, _widened(valid.ambient_degC), Outside.AMBIENT)
         found |= range_flags(self.leverage(states), (0.0, _MORE_LEVERAGE * valid.leverage), Outside.STATE)
         needed_s = self.history_s
         return found | range_flags(states.settled_s, (needed_s, np.inf), Outside.HISTORY)
@@ -145,16 +150,20 @@ def _widened(limits: Pair) -> Pair:
 
 def form_name(terms: tuple[Term, ...]) -> str:
     """`homography x (1, T, T^2), ambient lag 4 to 450 min, plays 3 to 14 K, plays of parts 1 to 4 K`."""
-    of_camera = {Kind.CONSTANT: "1", Kind.CAMERA: "T", Kind.CAMERA_SQUARE: "T^2"}
-    of_plays = {Kind.PLAY: "plays", Kind.PART_PLAY: "plays of parts"}
-    parts = [f"homography x ({', '.join(of_camera[term.kind] for term in terms if term.kind in of_camera)})"]
-    for kind in (kind for kind in Kind if kind not in (*of_camera, *of_plays)):
-        taus = [term.parameter / 60 for term in terms if term.kind is kind]
-        parts += [f"{kind} {_extent(taus)} min"] if taus else []
-    for kind, name in of_plays.items():
-        radii = [term.parameter for term in terms if term.kind is kind]
-        parts += [f"{name} {_extent(radii)} K"] if radii else []
-    return ", ".join(parts)
+    kept = [term for term in terms if remembered([term.feature])]
+    still = ", ".join(term.symbol for term in terms if term not in kept)
+    named = [_named(own) for kind in TERMS.values() if (own := [term for term in kept if type(term) is kind])]
+    named.sort(key=lambda name: name.split()[0])
+    return ", ".join([f"homography x ({still})", *named])
+
+
+def _named(terms: Sequence[Term]) -> str:
+    """Terms of one kind, with the range of its first parameter."""
+    kind = type(terms[0])
+    first = next(iter(kind.model_fields), "")
+    unit, size = ("min", 60.0) if first.endswith("_s") else (first.rpartition("_")[2], 1.0)
+    values = [getattr(term, first) / size for term in terms] if first else []
+    return f"{kind.title} {_extent(values)} {unit}" if values else kind.title
 
 
 def _extent(values: list[float]) -> str:

@@ -9,7 +9,8 @@ import numpy as np
 from thermostand.compensation.drift.candidates import between
 from thermostand.compensation.drift.condensed import INSTANT_NS, Index, Instants, condense_instants
 from thermostand.compensation.drift.displacements import Displacements, anchors, displacements
-from thermostand.compensation.drift.terms import Kind, Origin, Term, features
+from thermostand.compensation.drift.terms import Constant, Term, features
+from thermostand.compensation.expression import Origin
 from thermostand.compensation.history.states import Float, Memory, States
 from thermostand.compensation.history.thermal_history import states_at
 from thermostand.compensation.observations import Mask, Observations
@@ -99,7 +100,7 @@ def frame_states(observations: Observations, memory: Memory) -> States:
         own = observations.session == index
         found = states_at(history, memory, observations.time_ns[own], observations.camera_degC[own])
         rows[own] = found.rows
-    return States.from_rows(memory, rows)
+    return States(memory, rows)
 
 
 def self_heating_K(observations: Observations) -> float:
@@ -118,7 +119,7 @@ def training(observations: Observations, terms: tuple[Term, ...], memory: Memory
     origin = Origin(
         float(np.nanmean(states.camera_degC[reference])), float(np.nanmean(observations.air_degC[reference]))
     )
-    found = features(states, terms, origin)
+    found = features(states, [term.feature for term in terms], origin)
     against = anchors(observations)
     frames = observations.of(Role.REFERENCE, Role.FIT, Role.WARM_UP) & np.isfinite(found).all(axis=1)
     frames &= _trusted(observations, states, against)
@@ -143,7 +144,7 @@ def _relative(observations: Observations, terms: tuple[Term, ...], found: Float,
 
     The constant is the misfit at the reference: 1, and 0 in a session that has none.
     """
-    constant = np.array([term.kind is Kind.CONSTANT for term in terms])
+    constant = np.array([isinstance(term, Constant) for term in terms])
     has_reference = np.unique(observations.session[observations.of(Role.REFERENCE)])
     relative, first = found.copy(), np.zeros(len(terms))
     for index in np.unique(observations.session[against]):

@@ -7,89 +7,94 @@ The recursion that follows it is that of the runtime (drift_runtime.py): fed sam
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.drift_runtime import ThermalState
+from thermostand.compensation.drift_runtime import INPUTS, ThermalState
+from thermostand.compensation.expression import AIR
 
 Float = NDArray[np.float64]
-
-_SINGLES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """What a model needs remembered: lags of ambient, power and camera temperature with these time constants, plays of
-    the camera's temperature with these radii. self_heating_K: of a camera over the air that has been on for long.
-    part_plays: time constant (one of taus_s), share and radius of plays of parts that nobody measures, see
-    drift_runtime.ThermalState."""
+    """What a model needs remembered: lags and plays (compensation/expression.py), each after those it is made of.
+    self_heating_K: of a camera over the air that has been on for long."""
 
-    taus_s: tuple[float, ...] = ()
-    plays_K: tuple[float, ...] = ()
+    parts: tuple[Any, ...] = ()
     self_heating_K: float = 15.0
-    part_plays: tuple[tuple[float, float, float], ...] = ()
 
     @property
-    def plays(self) -> int:
-        """How many, those of parts among them."""
-        return len(self.plays_K) + len(self.part_plays)
+    def at(self) -> dict[Any, int]:
+        """Where in a state's values each input, lag and play is."""
+        return {part: place for place, part in enumerate((*INPUTS, *self.parts))}
+
+    @property
+    def longest_s(self) -> float:
+        """Its longest time constant; 0 without one."""
+        return max((tau_s for kind, _, tau_s in self.parts if kind == "lag"), default=0.0)
+
+    @property
+    def ambient_lag(self) -> Any:
+        """The quickest lag of the air; ValueError without one."""
+        return min((part for part in self.parts if part[:2] == ("lag", AIR)), key=lambda part: part[2])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """A camera's thermal state at F instants; K time constants and P plays as `memory` lists them, those of parts last.
-
-    camera_degC (F,): its own temperature. ambient_lag_degC, power_lag, camera_lag_degC (F, K): of the air near the
-    camera, of its supply (0..1), of its own temperature. play_degC (F, P). rate_K_per_h (F,): of the ambient.
-    on_s (F,): since it was switched on, inf when that was before the record. settled_s (F,): how long ago the state was
-    a guess, inf when it began as cold as the air. NaN where unknown.
-    """
+    """A camera's thermal state at F instants. rows (F, 3 + P + 2): camera, air and supply, the P lags and plays of
+    `memory`, then on_s and settled_s. NaN where unknown."""
 
     memory: Memory
-    camera_degC: Float
-    ambient_lag_degC: Float
-    power_lag: Float
-    camera_lag_degC: Float
-    play_degC: Float
-    rate_K_per_h: Float
-    on_s: Float
-    settled_s: Float
-
-    @classmethod
-    def from_rows(cls, memory: Memory, rows: Float) -> States:
-        """Of rows (F, 4 + 3 K + P) as `row_of` gives them."""
-        count = len(memory.taus_s)
-        singles, ambient, power, camera, plays = np.split(rows, _SINGLES + count * np.arange(4), axis=1)
-        return cls(memory, singles[:, 0], ambient, power, camera, plays, singles[:, 1], singles[:, 2], singles[:, 3])
+    rows: Float
 
     @classmethod
     def at_degC(cls, camera_degC: float | Float, count: int, memory: Memory | None = None) -> States:
         """Nothing but the camera's temperature is known, one or (F,), at `count` instants."""
         memory = memory or Memory()
-        rows = np.full((count, _SINGLES + 3 * len(memory.taus_s) + memory.plays), np.nan)
+        rows = np.full((count, len(memory.at) + 2), np.nan)
         rows[:, 0] = camera_degC
-        return cls.from_rows(memory, rows)
+        return cls(memory, rows)
 
     @property
-    def rows(self) -> Float:
-        """(F, 4 + 3 K + P), as `from_rows` takes them."""
-        singles = np.column_stack([self.camera_degC, self.rate_K_per_h, self.on_s, self.settled_s])
-        return np.hstack([singles, self.ambient_lag_degC, self.power_lag, self.camera_lag_degC, self.play_degC])
+    def columns(self) -> Float:
+        """(3 + P, F): the values, as `memory.at` places them."""
+        return self.rows.T[:-2]
+
+    @property
+    def camera_degC(self) -> Float:
+        """(F,): its own temperature."""
+        return self.rows[:, 0]
+
+    @property
+    def on_s(self) -> Float:
+        """(F,): since it was switched on, inf when that was before the record."""
+        return self.rows[:, -2]
+
+    @property
+    def settled_s(self) -> Float:
+        """(F,): how long ago the state was a guess, inf when it began as cold as the air."""
+        return self.rows[:, -1]
+
+    def of(self, parts: Iterable[Any]) -> Float:
+        """(F, N): these inputs, lags or plays. KeyError for what is not remembered."""
+        at = self.memory.at
+        return np.take(self.rows, [at[part] for part in parts], axis=1)
 
     def where(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> States:
         """The instants of an index or a mask, in its order."""
-        return States.from_rows(self.memory, self.rows[rows])
+        return States(self.memory, self.rows[rows])
 
 
 def state_of(memory: Memory) -> ThermalState:
     """A camera's thermal state that remembers this, before its first sample."""
-    return ThermalState(memory.taus_s, memory.plays_K, memory.self_heating_K, memory.part_plays)
+    return ThermalState(memory.parts, memory.self_heating_K)
 
 
 def row_of(state: ThermalState) -> Float:
-    """The state now, (4 + 3 K + P,), as States.from_rows takes it; all NaN in a gap."""
-    singles = [state.camera_degC, state.rate_K_per_h, state.on_s, state.settled_s]
-    lags = [state.ambient_lag[1:], state.power_lag[1:], state.camera_lag[1:]]
-    return np.concatenate([singles, *lags, state.plays]) + (0.0 if state.begun else math.nan)
+    """The state now, a row of States; all NaN in a gap."""
+    return np.array([*state.values, state.on_s, state.settled_s]) + (0.0 if state.begun else math.nan)

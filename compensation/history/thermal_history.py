@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from thermostand.compensation.expression import AIR, POWER, lag
 from thermostand.compensation.history.states import Float, Memory, States, row_of, state_of
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
@@ -81,9 +82,10 @@ def refined(history: History) -> History:
     if step_K < _FINE_K or not history.has_ambient or len(history.camera_ns) < _FEWEST_READINGS:
         return history
     shown, seconds = history.camera_degC, (history.camera_ns - history.camera_ns[0]) / NS_PER_S
-    states = states_at(history, Memory(_SHAPE_TAUS_S), history.camera_ns, shown)
+    lags = [lag(of, tau_s) for of in (AIR, POWER) for tau_s in _SHAPE_TAUS_S]
+    states = states_at(history, Memory(tuple(lags)), history.camera_ns, shown)
     ambient = interpolated(history.ambient_ns, history.ambient_degC, history.camera_ns, GAP_NS)
-    terms = np.column_stack([np.ones(len(shown)), ambient, states.ambient_lag_degC, states.power_lag])
+    terms = np.column_stack([np.ones(len(shown)), ambient, states.of(lags)])
     known = np.isfinite(terms).all(axis=1)
     shape = np.where(known, terms @ damped_least_squares(terms[known], shown[known]), shown)
     changes = np.flatnonzero((np.diff(shown) != 0) & (np.diff(history.camera_ns) < _CHANGE_NS))
@@ -142,7 +144,7 @@ def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: F
     written to.
     """
     times_ns, degC = np.asarray(time_ns, np.int64), np.asarray(camera_degC, np.float64)
-    return States.from_rows(memory, _rows_at(history, memory, times_ns.tobytes(), degC.tobytes()))
+    return States(memory, _rows_at(history, memory, times_ns.tobytes(), degC.tobytes()))
 
 
 @lru_cache(maxsize=8)

@@ -7,10 +7,9 @@ import numpy as np
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.drift.polynomial import exponents
-from thermostand.compensation.drift.terms import Kind, Term
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.drift_runtime import SPAN_K
-from thermostand.compensation.reporting.numbers import FormulaNumbers
+from thermostand.compensation.expression import SPAN_K
+from thermostand.compensation.reporting.numbers import FormulaNumbers, typeset
 
 _MOTIONS = ("a₁", "a₂", "a₃", "a₄", "a₅", "a₆", "a₇", "a₈")
 
@@ -61,23 +60,8 @@ def _thermal(model: ThermalModel) -> FormulaNumbers:
     return FormulaNumbers(
         lines,
         tuple(f"{name}, px" for name in _MOTIONS),
-        tuple(_feature(term) for term in model.terms),
+        tuple(typeset(term.symbol) for term in model.terms),
         model.coefficients.T,
         sigma.T,
         tuple(model.reference_features.tolist()),
     )
-
-
-def _feature(term: Term) -> str:
-    minutes = f"{term.parameter / 60:g} min"
-    return {
-        Kind.CONSTANT: "1",
-        Kind.CAMERA: "T",
-        Kind.CAMERA_SQUARE: "T²",
-        Kind.AMBIENT_LAG: f"air({minutes})",
-        Kind.AMBIENT_LAG_SQUARE: f"air({minutes})²",
-        Kind.AMBIENT_LAG_CUBE: f"air({minutes})³",
-        Kind.CAMERA_LAG: f"camera({minutes})",
-        Kind.PLAY: f"play({term.parameter:g} K)",
-        Kind.PART_PLAY: f"play({term.parameter:g} K, {term.tau_s / 60:g} min, {term.share:g})",
-    }[term.kind]

@@ -203,9 +203,8 @@ def significant(value: float, digits: int) -> str:
 
 def typeset(text: str) -> str:
     """A form's name with signs and powers as they are printed."""
-    for written, printed in (("T^2", "T²"), ("homography x ", "homography × "), ("-", "−")):
-        text = text.replace(written, printed)
-    return re.sub(r"P\^(\d)", lambda found: "P" + "⁰¹²³⁴⁵⁶⁷⁸⁹"[int(found[1])], text)
+    text = text.replace("homography x ", "homography × ").replace("-", "−")
+    return re.sub(r"\^(\d)", lambda found: "⁰¹²³⁴⁵⁶⁷⁸⁹"[int(found[1])], text)
 
 
 def compact(value: float, u: float) -> str:

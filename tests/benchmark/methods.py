@@ -14,6 +14,7 @@ from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.displacements import displacements
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.expression import AIR
 from thermostand.compensation.history.states import States
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
@@ -88,8 +89,9 @@ def gp_on_residual(training: Observations) -> Corrector:
 
 
 def _inputs(states: States) -> Float:
-    slowest = states.ambient_lag_degC[:, -1:] if states.ambient_lag_degC.shape[1] else states.camera_degC[:, None]
-    return np.column_stack([states.camera_degC, np.nan_to_num(slowest), np.nan_to_num(states.rate_K_per_h)])
+    lags = sorted((part for part in states.memory.parts if part[:2] == ("lag", AIR)), key=lambda part: part[2])
+    air, quick, slow = states.of([AIR, *(lags[:: max(len(lags) - 1, 1)] or (AIR, AIR))]).T
+    return np.column_stack([states.camera_degC, np.nan_to_num(slow), np.nan_to_num(air - quick)])
 
 
 class _Gp:

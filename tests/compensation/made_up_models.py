@@ -8,7 +8,17 @@ import pytest
 from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel
 from thermostand.compensation.drift.polynomial import exponents
-from thermostand.compensation.drift.terms import Kind, Term
+from thermostand.compensation.drift.terms import (
+    AmbientLag,
+    AmbientLagCubed,
+    AmbientLagSquared,
+    CameraLag,
+    Constant,
+    OfCamera,
+    OfCameraSquared,
+    OfPartPlay,
+    OfPlay,
+)
 from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange
 
 SIZE = (640, 480)
@@ -45,14 +55,12 @@ def paper(degree: int = 3) -> PaperModel:
 def thermal(*, warmed: bool = True) -> ThermalModel:
     """With a term of every kind."""
     terms = (
-        *(Term(kind) for kind in (Kind.CONSTANT, Kind.CAMERA, Kind.CAMERA_SQUARE)),
-        *(Term(Kind.AMBIENT_LAG, tau_s) for tau_s in (600.0, 3600.0)),
-        *(Term(kind, 3600.0) for kind in (Kind.AMBIENT_LAG_SQUARE, Kind.AMBIENT_LAG_CUBE)),
-        Term(Kind.CAMERA_LAG, 600.0),
-        Term(Kind.PLAY, 6.0),
-        Term(Kind.PLAY, 3.0),
-        Term(Kind.PART_PLAY, 2.0, 3600.0, 0.3),
-        Term(Kind.PART_PLAY, 1.0, 600.0, 0.1),
+        *(Constant(), OfCamera(), OfCameraSquared()),
+        *(AmbientLag(tau_s=tau_s) for tau_s in (600.0, 3600.0)),
+        *(AmbientLagSquared(tau_s=3600.0), AmbientLagCubed(tau_s=3600.0), CameraLag(tau_s=600.0)),
+        *(OfPlay(radius_K=6.0), OfPlay(radius_K=3.0)),
+        OfPartPlay(radius_K=2.0, tau_s=3600.0, share=0.3),
+        OfPartPlay(radius_K=1.0, tau_s=600.0, share=0.1),
     )
     rng = np.random.default_rng(7)
     return ThermalModel(

@@ -10,6 +10,7 @@ from thermostand.compensation.design.forecast import Situation, Surroundings, af
 from thermostand.compensation.design.next_visit import Decision, Wanted, decide
 from thermostand.compensation.design.wanted_states import wanted_states
 from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.expression import AIR, CAMERA, lag, play
 from thermostand.compensation.history.states import Float, Memory
 from thermostand.compensation.observations import Observations
 
@@ -17,7 +18,9 @@ from .drawn_cameras import drawn_camera
 from .drawn_nights import Stretch, night, reference, warm_up
 
 WANTED = Wanted((10.0, 52.0), 0.005, held_out_degC=(20.0, 34.0))
-MEMORY = Memory((480.0, 3000.0), (5.0,), 15.0)
+AIR_LAGS = [lag(AIR, tau_s) for tau_s in (480.0, 3000.0)]
+CAMERA_LAGS = [lag(CAMERA, tau_s) for tau_s in (480.0, 3000.0)]
+MEMORY = Memory((*AIR_LAGS, *CAMERA_LAGS, play(CAMERA, 5.0)))
 BEGUN = [*warm_up(), *reference()]
 VISITS = [Stretch(degC, 1500, "fit", 5) for degC in (52.0, 10.0, 45.0, 17.0, 31.0)]
 
@@ -43,8 +46,8 @@ def test_camera_and_lags_are_foreseen(observed: Observations):
     foreseen = after(around, now(before, MEMORY), np.array([31.0]), np.array([1500.0])).states
     came = frame_states(observed, MEMORY).where(np.array([len(observed.frame) - 1]))
     assert foreseen.camera_degC == pytest.approx(came.camera_degC, abs=0.5)
-    assert foreseen.ambient_lag_degC[0] == pytest.approx(came.ambient_lag_degC[0], abs=0.5)
-    assert foreseen.camera_lag_degC[0] == pytest.approx(came.camera_lag_degC[0], abs=0.5)
+    assert foreseen.of(AIR_LAGS)[0] == pytest.approx(came.of(AIR_LAGS)[0], abs=0.5)
+    assert foreseen.of(CAMERA_LAGS)[0] == pytest.approx(came.of(CAMERA_LAGS)[0], abs=0.5)
 
 
 def test_a_long_dwell_comes_to_rest(observed: Observations):
@@ -53,8 +56,8 @@ def test_a_long_dwell_comes_to_rest(observed: Observations):
     rest = at_rest(around, np.array([40.0, 40.0]), MEMORY).states
     long = after(around, begun, np.array([40.0, 40.0]), np.full(2, 12 * 3600.0)).states
     assert long.camera_degC == pytest.approx(rest.camera_degC, abs=0.01)
-    assert long.ambient_lag_degC == pytest.approx(rest.ambient_lag_degC, abs=0.01)
-    assert long.play_degC[:, 0] - long.camera_degC == pytest.approx([-5.0, 5.0], abs=0.01)
+    assert long.of(AIR_LAGS) == pytest.approx(rest.of(AIR_LAGS), abs=0.01)
+    assert long.of([play(CAMERA, 5.0)])[:, 0] - long.camera_degC == pytest.approx([-5.0, 5.0], abs=0.01)
 
 
 def test_the_ends_of_the_range_teach_most_about_a_straight_line():
@@ -74,10 +77,10 @@ def test_the_ends_of_the_range_teach_most_about_a_straight_line():
 def test_a_part_that_creeps_is_shown_by_staying():
     """At the end of eight hours at one end of the range it has gone further than on any way to and fro."""
     around = Surroundings(np.array([0.0, 1.0]), np.array([15.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 20.0)
-    here = at_rest(around, np.array([31.0]), Memory((20000.0,)))
+    here = at_rest(around, np.array([31.0]), Memory((lag(AIR, 20000.0),)))
 
     def creep(situation: Situation) -> Float:
-        return (situation.states.ambient_lag_degC - 31.0) / 20.0
+        return (situation.states.of([lag(AIR, 20000.0)]) - 31.0) / 20.0
 
     known = Known(np.array([[1e-4]]), 1e-4, np.array([[1.0]]), creep)
     chosen = best_course(known, here, around, np.linspace(10.0, 52.0, 13), (7200.0,), seed=1)
@@ -93,7 +96,7 @@ def test_states_at_rest_are_nearer_to_the_chamber_than_those_on_the_way(observed
     for kind in ("at_rest", "on_the_way"):
         states = wanted_states(around, MEMORY, (10.0, 52.0), (kind,)).states
         places = around.air_degC(np.tile(np.linspace(10.0, 52.0, 7), 3))
-        away_K[kind] = float(np.abs(states.ambient_lag_degC[:, 1] - places).max())
+        away_K[kind] = float(np.abs(states.of(AIR_LAGS)[:, 1] - places).max())
     assert away_K["at_rest"] < 0.5 < 5.0 < away_K["on_the_way"]
     both = wanted_states(around, MEMORY, (10.0, 52.0), ("at_rest", "on_the_way"))
     assert len(both.air_degC) == len(both.states.camera_degC) == 42

@@ -189,7 +189,7 @@ def damaged(text: str) -> dict[str, str]:
         "empty": "",
         "list": "[]",
         "other format": json.dumps({**data, "format": "something else"}),
-        "later version": json.dumps({**data, "schema_version": 10}),
+        "later version": json.dumps({**data, "schema_version": 11}),
         "text for number": json.dumps({**data, "reference_degC": "warm"}),
         "nan": text.replace('"reference_degC": 39.0', '"reference_degC": NaN'),
         "key missing": json.dumps({name: value for name, value in data.items() if name != "hull_px"}),

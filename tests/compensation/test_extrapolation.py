@@ -70,7 +70,7 @@ def test_few_held_out_set_points_between_fitted_ones_are_flagged(seed: int) -> N
 
 def test_a_form_without_lags_knows_the_range_of_the_air() -> None:
     model, _ = narrow(2)
-    assert model.memory.taus_s
+    assert model.memory.parts
     assert model.valid.ambient_degC[0] > 16
     assert model.valid.ambient_degC[1] < 46
 

@@ -20,6 +20,7 @@ import pytest
 import thermostand
 from thermostand import compensation, markers, recording
 from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.expression import POWER, lag
 from thermostand.compensation.history.states import Memory
 from thermostand.compensation.history.thermal_history import History, states_at
 from thermostand.experiments.steps import Role
@@ -198,17 +199,18 @@ def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings(
     air = (air_ns, np.full(len(air_ns), 24.0))
     known: dict[str, Any] = {"air": air}
     told: dict[str, Any] = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
-    memory = Memory((1620.0,), (), 15.0)
+    slow = [lag(POWER, 1620.0)]
+    memory = Memory(tuple(slow))
     history = History(*air, air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
     truth = states_at(history, memory, air_ns[frames], own_degC[frames])
     model: Any = SimpleNamespace(memory=memory)
     found = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **told)
-    np.testing.assert_allclose(found.power_lag, truth.power_lag)
+    np.testing.assert_allclose(found.of(slow), truth.of(slow))
     blind = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **known)
-    assert np.abs(blind.power_lag - truth.power_lag).max() > 0.1
+    assert np.abs(blind.of(slow) - truth.of(slow)).max() > 0.1
     centres_px = np.tile([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0], [9.0, 9.0]], (4, 1, 1))
     seen = thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], **told)
-    np.testing.assert_allclose(frame_states(seen, memory).power_lag, truth.power_lag)
+    np.testing.assert_allclose(frame_states(seen, memory).of(slow), truth.of(slow))
     with pytest.raises(ValueError, match="only together with air"):
         thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], supply=told["supply"])
     with pytest.raises(ValueError, match="time_ns go backwards"):

@@ -17,7 +17,7 @@ from thermostand.compensation.budget.geometry import StandTemperatures
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.drift.paper_model import PaperModel
-from thermostand.compensation.drift.terms import Origin, features
+from thermostand.compensation.drift.terms import features
 from thermostand.compensation.history.states import States
 from thermostand.compensation.observations import Observations
 from thermostand.compensation.reporting.compensation_section import uncertainty_section
@@ -329,9 +329,10 @@ def test_the_formula_in_the_report_gives_the_model_s_corrections(analysed: Analy
 def test_the_formula_of_the_thermal_form_is_its_homography():
     model = thermal()
     formula = formula_of(model)
-    states = States.from_rows(model.memory, np.full((1, 4 + 3 * 2 + model.memory.plays), 30.0))
-    origin = Origin(model.facts.reference_degC, model.reference_ambient_degC)
-    amounts = (features(states, model.terms, origin) - np.array(formula.reference)) @ formula.coefficients_px
+    states = States(model.memory, np.full((1, len(model.memory.at) + 2), 30.0))
+    amounts = (
+        features(states, [term.feature for term in model.terms], model.origin) - np.array(formula.reference)
+    ) @ formula.coefficients_px
     a = amounts[0]
     place = np.array([[200.0, 100.0]])
     width, height = model.facts.image_size

@@ -32,7 +32,7 @@ def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(mod
         if number % 7 and not np.isnan(sample).any():
             continue
         states = (
-            States.from_rows(model.memory, row_of(state)[None])
+            States(model.memory, row_of(state)[None])
             if model.form == "thermal"
             else States.at_degC(live._camera_degC, 1)
         )
@@ -66,7 +66,7 @@ def test_the_module_needs_numpy_only_and_runs_where_nothing_else_is(tmp_path: Pa
     state = state_of(thermal().memory)
     for _ in range(2000):
         state.advance(10, 24.0, 1, 44.0)
-    states = States.from_rows(thermal().memory, row_of(state)[None])
+    states = States(thermal().memory, row_of(state)[None])
     expected = thermal().correct(np.array([[320.5, 200.25]]), states)
     np.testing.assert_allclose(json.loads(done.stdout), expected, atol=1e-9)
 
@@ -80,7 +80,7 @@ def test_a_file_that_is_no_runtime_model_is_refused():
     with pytest.raises(ValueError, match="not a drift runtime model"):
         Drift({"format": "thermostand drift model"})
     with pytest.raises(ValueError, match="of this version; export the model anew"):
-        Drift(runtime_model(thermal()) | {"version": 2})
+        Drift(runtime_model(thermal()) | {"version": 3})
 
 
 def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_path: Path):

@@ -16,7 +16,7 @@ from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.drift.paper_model import PaperModel
-from thermostand.compensation.drift.terms import Kind
+from thermostand.compensation.drift.terms import OfPlay
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states
@@ -104,7 +104,7 @@ def test_a_warm_up_elsewhere_is_predicted_when_one_was_recorded_and_not_otherwis
 def test_plays_help_a_camera_with_play_and_are_not_taken_for_one_without(thermal: ThermalModel):
     loose = session(warm_up(24.0) + reference() + cycle(), plays=True)
     model = fit_thermal(loose[0])
-    plays = [term.kind is Kind.PLAY for term in model.terms]
+    plays = [isinstance(term, OfPlay) for term in model.terms]
     of_loose_px, of_tight_px = (np.abs(one.coefficients[:2, plays]).max() for one in (model, thermal))
     assert of_tight_px < 0.003 < 0.03 < of_loose_px
     assert left_mpx(fit_paper(loose[0], 4), loose, Role.VALIDATION) > 50.0
@@ -122,7 +122,7 @@ def test_the_95_percent_interval_holds_95_percent_at_held_out_temperatures(night
 def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(night: Seen, thermal: ThermalModel):
     states = frame_states(night[0], thermal.memory)
     usual = states.where(np.flatnonzero(night[0].of(Role.FIT))[:1])
-    hot = States.from_rows(usual.memory, usual.rows + np.where(np.arange(usual.rows.shape[1]) == 0, 60.0, 0.0))
+    hot = States(usual.memory, usual.rows + np.where(np.arange(usual.rows.shape[1]) == 0, 60.0, 0.0))
     points = np.array([[1200.0, 1000.0], [2200.0, 1600.0]])
     near, far = thermal.covariance(points, usual), thermal.covariance(points, hot)
     np.testing.assert_allclose(near, near.transpose(0, 2, 1), rtol=0, atol=1e-12)
@@ -137,10 +137,15 @@ def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
     assert not any(thermal.flags(point, states.where(np.array([k])))[0] for k in np.flatnonzero(inside))
     usual = states.where(np.flatnonzero(inside)[-1:])
     assert thermal.flags(np.array([[20.0, 1000.0]]), usual)[0] == Outside.PLACE
-    for column, value, flag in ((0, 90.0, Outside.CAMERA), (4, 90.0, Outside.AMBIENT), (2, 0.0, Outside.SWITCHED_ON)):
+    ambient = thermal.memory.at[thermal.memory.ambient_lag]
+    for column, value, flag in (
+        (0, 90.0, Outside.CAMERA),
+        (ambient, 90.0, Outside.AMBIENT),
+        (-2, 0.0, Outside.SWITCHED_ON),
+    ):
         rows = usual.rows.copy()
         rows[0, column] = value
-        found = thermal.flags(point, States.from_rows(usual.memory, rows))[0]
+        found = thermal.flags(point, States(usual.memory, rows))[0]
         assert found & ~Outside.STATE == flag  # far away enough, and the whole state is unlike any
     unknown = States.at_degC(45.0, 1, thermal.memory)
     assert thermal.flags(point, unknown)[0] & Outside.HISTORY
@@ -163,7 +168,7 @@ def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, ther
     at_ns = record.ambient_ns[end - 1 : end]
     offline = states_at(record, thermal.memory, at_ns, camera_degC[end - 1 : end])
     point = np.array([[1200.0, 1000.0]])
-    live = States.from_rows(thermal.memory, row_of(state)[None])
+    live = States(thermal.memory, row_of(state)[None])
     np.testing.assert_allclose(thermal.shift(point, live), thermal.shift(point, offline), atol=1e-6)
 
 
@@ -187,9 +192,9 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
         np.testing.assert_equal(getattr(loaded.facts, name), getattr(thermal.facts, name), err_msg=name)
     assert loaded.valid.__repr__() == thermal.valid.__repr__()
     data = json.loads((tmp_path / "model.json").read_text())
-    assert (data["form"], data["schema_version"]) == ("thermal", 9)
-    (tmp_path / "older.json").write_text(json.dumps({**data, "schema_version": 8}))
-    with pytest.raises(SessionError, match="schema_version: 8 is of an earlier, unreleased version"):
+    assert (data["form"], data["schema_version"]) == ("thermal", 10)
+    (tmp_path / "older.json").write_text(json.dumps({**data, "schema_version": 9}))
+    with pytest.raises(SessionError, match="schema_version: 9 is of an earlier, unreleased version"):
         load_model(tmp_path / "older.json")
     (tmp_path / "model.json").write_text(json.dumps({**data, "reference_features": [0.0]}))
     with pytest.raises(SessionError, match="reference_features: shape"):

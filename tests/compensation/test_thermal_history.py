@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.drift_runtime import ThermalState
+from thermostand.compensation.expression import AIR, CAMERA, POWER, lag, play
 from thermostand.compensation.history.states import Memory, States, row_of, state_of
 from thermostand.compensation.history.thermal_history import History, refined, states_at
 
 S = 1_000_000_000
-MEMORY = Memory((600.0, 3600.0), (2.0,), 20.0)
+TAUS_S = (600.0, 3600.0)
+AIR_LAGS, POWER_LAGS, CAMERA_LAGS = ([lag(of, tau_s) for tau_s in TAUS_S] for of in (AIR, POWER, CAMERA))
+PLAY = play(CAMERA, 2.0)
+MEMORY = Memory((*AIR_LAGS, *POWER_LAGS, *CAMERA_LAGS, PLAY), 20.0)
 STEP_AT_S, END_S = 3600, 4 * 3600
 
 
@@ -41,13 +45,12 @@ def at(record: History, *seconds: int, camera_degC: float = 54.0) -> States:
 @pytest.mark.parametrize("after_s", [600, 1800, 7200])
 def test_a_lag_follows_a_step_as_the_exponential_does(after_s: int):
     found = at(history(), STEP_AT_S + after_s)
-    for column, tau_s in enumerate(MEMORY.taus_s):
+    for column, tau_s in enumerate(TAUS_S):
         expected = 34 - 10 * np.exp(-after_s / tau_s)
-        assert found.ambient_lag_degC[0, column] == pytest.approx(expected, abs=0.05)  # the step takes 5 s
-        assert found.camera_lag_degC[0, column] == pytest.approx(expected + 20, abs=0.06)
-    assert found.power_lag[0].tolist() == [1.0, 1.0]
-    assert found.play_degC[0, 0] == pytest.approx(52.0)  # 2 K behind 54 degC
-    assert found.rate_K_per_h[0] == pytest.approx(6 * 10 * np.exp(-after_s / 600), abs=0.2)
+        assert found.of(AIR_LAGS)[0, column] == pytest.approx(expected, abs=0.05)  # the step takes 5 s
+        assert found.of(CAMERA_LAGS)[0, column] == pytest.approx(expected + 20, abs=0.06)
+    assert found.of(POWER_LAGS)[0].tolist() == [1.0, 1.0]
+    assert found.of([PLAY])[0, 0] == pytest.approx(52.0)  # 2 K behind 54 degC
 
 
 def test_states_that_are_asked_for_again_are_kept_and_those_of_anything_else_are_not():
@@ -55,26 +58,26 @@ def test_states_that_are_asked_for_again_are_kept_and_those_of_anything_else_are
     first = at(record, 1800, 5400)
     with pytest.raises(ValueError, match="read-only"):
         first.camera_degC[0] = 0.0
-    assert np.shares_memory(first.play_degC, at(record, 1800, 5400).play_degC)
-    assert at(record, 1800, 5400, camera_degC=60.0).play_degC[1, 0] == pytest.approx(58.0)  # 2 K behind
-    assert at(record, 1800, 7200).ambient_lag_degC[1, 0] > first.ambient_lag_degC[1, 0] + 0.1
+    assert np.shares_memory(first.rows, at(record, 1800, 5400).rows)
+    assert at(record, 1800, 5400, camera_degC=60.0).of([PLAY])[1, 0] == pytest.approx(58.0)  # 2 K behind
+    assert at(record, 1800, 7200).of(AIR_LAGS)[1, 0] > first.of(AIR_LAGS)[1, 0] + 0.1
     warmer = replace(record, ambient_degC=record.ambient_degC + 1)
-    assert at(warmer, 1800, 5400).ambient_lag_degC[0, 0] == pytest.approx(25.0)
+    assert at(warmer, 1800, 5400).of(AIR_LAGS)[0, 0] == pytest.approx(25.0)
 
 
 def test_a_part_between_air_and_camera_has_plays_of_its_own():
     """Switched on, the chip is 20 K warmer and the part 0.3 of that; its play is left 2 K behind, and behind 54 degC of
     the air when all has settled there."""
-    memory = replace(MEMORY, part_plays=((600.0, 0.3, 2.0),))
-    state = ThermalState(memory.taus_s, memory.plays_K, memory.self_heating_K, memory.part_plays)
+    air, camera = AIR_LAGS[0], CAMERA_LAGS[0]
+    state = ThermalState((air, camera, PLAY, play(air + 0.3 * (camera - air), 2.0)), 20.0)
     state.advance(10.0, 24.0, 1.0, 24.0)
-    assert state.plays.tolist() == [24.0, 24.0]
+    assert state.values[-2:] == [24.0, 24.0]
     for _ in range(2000):
         state.advance(10.0, 24.0, 1.0, 44.0)
-    assert state.plays == pytest.approx([42.0, 28.0], abs=1e-6)
+    assert state.values[-2:] == pytest.approx([42.0, 28.0], abs=1e-6)
     for _ in range(2000):
         state.advance(10.0, 54.0, 1.0, 74.0)
-    assert state.plays == pytest.approx([72.0, 58.0], abs=1e-6)
+    assert state.values[-2:] == pytest.approx([72.0, 58.0], abs=1e-6)
 
 
 def test_a_warm_start_is_a_guess_and_a_cold_one_is_known():
@@ -84,14 +87,14 @@ def test_a_warm_start_is_a_guess_and_a_cold_one_is_known():
     cold = at(history(camera_excess_K=0.5), 1800, camera_degC=24.5)
     assert cold.settled_s[0] == np.inf
     assert cold.on_s[0] == pytest.approx(1800)
-    np.testing.assert_allclose(cold.power_lag[0], -np.expm1(-1800 / np.array(MEMORY.taus_s)), rtol=1e-9)
+    np.testing.assert_allclose(cold.of(POWER_LAGS)[0], -np.expm1(-1800 / np.array(TAUS_S)), rtol=1e-9)
     half = at(history(camera_excess_K=10.0), 0 + 10, camera_degC=34.0)
-    np.testing.assert_allclose(half.power_lag[0], 0.5, atol=0.02)
+    np.testing.assert_allclose(half.of(POWER_LAGS)[0], 0.5, atol=0.02)
 
 
 @pytest.mark.parametrize(("stated_degC", "known"), [(21.0, True), (27.0, False)])
 def test_a_camera_that_is_as_cold_as_the_air_when_it_is_switched_on_was_in_equilibrium(stated_degC: float, known: bool):
-    state = ThermalState(MEMORY.taus_s, MEMORY.plays_K, MEMORY.self_heating_K)
+    state = state_of(MEMORY)
     for _ in range(100):
         state.advance(10.0, 20.0, 0.0, math.nan)
     assert state.settled_s == 1000.0
@@ -100,7 +103,7 @@ def test_a_camera_that_is_as_cold_as_the_air_when_it_is_switched_on_was_in_equil
 
 
 def test_a_camera_that_was_on_before_and_is_cold_after_a_pause_is_known_no_better():
-    state = ThermalState(MEMORY.taus_s, MEMORY.plays_K, MEMORY.self_heating_K)
+    state = state_of(MEMORY)
     state.advance(10.0, 20.0, 1.0, 40.0)
     for _ in range(600):
         state.advance(10.0, 20.0, 0.0, math.nan)
@@ -110,7 +113,7 @@ def test_a_camera_that_was_on_before_and_is_cold_after_a_pause_is_known_no_bette
 
 def test_power_counts_from_the_instant_it_came_on():
     found = at(history(on_at_s=1803), 1803 + 600, camera_degC=44.0)
-    np.testing.assert_allclose(found.power_lag[0], -np.expm1(-600 / np.array(MEMORY.taus_s)), rtol=1e-4)
+    np.testing.assert_allclose(found.of(POWER_LAGS)[0], -np.expm1(-600 / np.array(TAUS_S)), rtol=1e-4)
     assert found.on_s[0] == pytest.approx(600)
 
 
@@ -119,10 +122,10 @@ def test_after_a_gap_the_state_is_a_guess_again():
     before, during, after = (at(history(gap=gap), second) for second in (4990, 6000, 7600))
     assert before.settled_s[0] == pytest.approx(4990)
     assert np.isnan(during.settled_s[0])
-    assert np.isnan(during.ambient_lag_degC).all()
+    assert np.isnan(during.of(AIR_LAGS)).all()
     assert during.camera_degC[0] == 54.0  # the frame itself tells it
     assert 580 < after.settled_s[0] <= 600
-    np.testing.assert_allclose(after.ambient_lag_degC, 34.0)  # as in equilibrium
+    np.testing.assert_allclose(after.of(AIR_LAGS), 34.0)  # as in equilibrium
     short = at(history(gap=(5000, 5100)), 7600)
     assert short.settled_s[0] == pytest.approx(7600)
 
@@ -144,7 +147,7 @@ def test_before_the_record_and_without_one_only_the_camera_is_known():
     for record in (late, empty):
         found = at(record, 100)
         assert found.camera_degC[0] == 54.0
-        assert np.isnan(found.ambient_lag_degC).all()
+        assert np.isnan(found.of(AIR_LAGS)).all()
         assert np.isnan(found.settled_s).all()
 
 
@@ -164,9 +167,9 @@ def test_a_display_in_quarters_is_refined_between_its_steps():
 
 
 def test_a_play_stays_until_it_is_pushed_from_either_side():
-    state = ThermalState((), (1.0, 3.0), 20.0)
+    state = ThermalState((play(CAMERA, 1.0), play(CAMERA, 3.0)), 20.0)
     places: list[list[float]] = []
     for camera_degC in (0.0, 0.5, 5.0, 3.5, -2.0):
         state.advance(10.0, 0.0, 1.0, camera_degC)
-        places.append(state.plays.tolist())
+        places.append(state.values[-2:])
     assert places[1:] == [[0, 0], [4, 2], [4, 2], [-1, 1]]

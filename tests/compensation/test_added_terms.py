@@ -1,0 +1,167 @@
+"""A kind of drift term that another package adds is found everywhere by its one class."""
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermostand.compensation.apply.c_header import export_c
+from thermostand.compensation.apply.runtime_export import export
+from thermostand.compensation.design.forecast import after, at_rest, now, surroundings
+from thermostand.compensation.design.next_visit import Wanted, decide
+from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.terms import TERMS
+from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift_runtime import Drift
+from thermostand.compensation.drift_runtime import compiled as worked_out
+from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, in_c, in_words, lag, play
+from thermostand.compensation.history.states import States, row_of, state_of
+from thermostand.compensation.reporting.formula import formula_of
+from thermostand.foundation.errors import ConfigError, SessionError
+
+from .compiled_header import COMPILER, compiled, said
+from .drawn_cameras import drawn_camera
+from .drawn_nights import Night, Stretch, night, reference, warm_up
+from .made_up_models import LIFE
+
+MODULE = '''
+from pydantic import Field
+from typing import Annotated
+from thermostand.compensation.drift.terms import Term
+from thermostand.compensation.expression import AIR, CAMERA, POWER, away, lag
+
+class Gradient(Term):
+    """Of a tube that is warm at the camera's end: a lag of a lag, times how long the camera has been on."""
+    kind = "tube gradient"
+    tau_s: Annotated[float, Field(gt=0)]
+
+    @property
+    def feature(self):
+        return away(lag(lag(CAMERA, self.tau_s), 300.0) - lag(AIR, self.tau_s)) * lag(POWER, 1200.0)
+
+    @classmethod
+    def usual(cls):
+        return (cls(tau_s=700.0), cls(tau_s=2000.0))
+'''
+INFO = "Metadata-Version: 2.1\nName: acme-tube\nVersion: 1.0\n"
+VISITS = [Stretch(degC, 1500, "fit", 5) for degC in (52.0, 10.0, 45.0, 17.0, 31.0)]
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The package, installed; nothing of this program knows it."""
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "acme_tube.py").write_text(MODULE)
+    info = folder / "acme_tube-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(INFO)
+    (info / "entry_points.txt").write_text("[thermostand.drift_terms]\ntube gradient = acme_tube:Gradient\n")
+    sys.path.insert(0, str(folder))
+    yield
+    sys.path.remove(str(folder))
+    TERMS.pop("tube gradient", None)
+    sys.modules.pop("acme_tube", None)
+
+
+@pytest.fixture(scope="module")
+def seen(tube: None) -> Night:
+    return night(drawn_camera(3), [*warm_up(), *reference(), *VISITS])
+
+
+@pytest.fixture(scope="module")
+def model(seen: Night) -> ThermalModel:
+    return fit_thermal(seen.observed)
+
+
+def added(model: ThermalModel) -> list[int]:
+    return [number for number, term in enumerate(model.terms) if term.kind == "tube gradient"]
+
+
+def test_a_fit_has_it_and_a_file_keeps_it(model: ThermalModel, tmp_path: Path):
+    assert [model.terms[number].model_dump() for number in added(model)] == [{"tau_s": 700.0}, {"tau_s": 2000.0}]
+    assert np.abs(model.coefficients[:, added(model)]).min() > 0
+    assert "tube gradient 11.6667 to 33.3333 min" in model.title
+    save_model(model, tmp_path / "model.json")
+    TERMS.pop("tube gradient")
+    sys.modules.pop("acme_tube")  # another program reads it
+    loaded = load_model(tmp_path / "model.json")
+    assert isinstance(loaded, ThermalModel)
+    assert [term.model_dump() for term in loaded.terms] == [term.model_dump() for term in model.terms]
+    data = json.loads((tmp_path / "model.json").read_text())
+    data["terms"][added(model)[0]]["tau_s"] = -1.0
+    (tmp_path / "model.json").write_text(json.dumps(data))
+    with pytest.raises(SessionError, match=r"terms.*tau_s"):
+        load_model(tmp_path / "model.json")
+
+
+def test_the_report_s_formula_has_it(model: ThermalModel):
+    formula = formula_of(model)
+    assert formula.terms[added(model)[0]] == "(lag(camera(11.6667 min), 5 min) − air(11.6667 min)) supply(20 min)"
+    assert formula.coefficients_px.shape == (len(model.terms), 8)
+
+
+def test_the_run_time_and_the_header_have_it(model: ThermalModel, tmp_path: Path):
+    export(model, tmp_path)
+    drift, state = Drift.load(tmp_path / "drift.json"), state_of(model.memory)
+    places = model.facts.reference_centres_px[:6]
+    corrected, flags = [], []
+    for sample in LIFE:
+        drift.advance(*sample)
+        state.advance(*sample)
+        corrected.append(drift.correct(places))
+        flags.append(drift.flags(places))
+    here = States(model.memory, row_of(state)[None])
+    np.testing.assert_allclose(corrected[-1], model.correct(places, here), rtol=0, atol=1e-9)
+    if COMPILER is not None:
+        c = said(compiled(export_c(model, tmp_path / "drift.h")), places, np.array(LIFE), model.facts.image_size)
+        np.testing.assert_allclose(c.corrected_px, corrected, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(c.flags, flags)
+
+
+def test_the_forecast_has_it(seen: Night, model: ThermalModel):
+    around = surroundings(seen.observed, ramp_K_per_min=20.0)
+    inner = [part for part in model.memory.parts if part[0] == "lag" and part[1] not in (AIR, CAMERA, POWER)]
+    assert len(inner) == 2
+    long = after(around, now(seen.observed, model.memory), np.array([40.0]), np.full(1, 12 * 3600.0)).states
+    rest = at_rest(around, np.array([40.0]), model.memory).states
+    assert long.of(inner) == pytest.approx(rest.of(inner), abs=0.01)
+    assert decide(seen.observed, Wanted((10.0, 52.0), 1e-4)).reason.startswith("the residual is predicted")
+
+
+def test_a_package_that_is_broken_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen: Night):
+    monkeypatch.syspath_prepend(tmp_path)
+    info = tmp_path / "acme_none-2.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(INFO.replace("acme-tube\nVersion: 1.0", "acme-none\nVersion: 2.0"))
+    (info / "entry_points.txt").write_text("[thermostand.drift_terms]\nnone = acme_none:No\n")
+    with pytest.raises(ConfigError, match=r"none: acme-none 2.0 cannot be loaded.*reinstall it"):
+        fit_thermal(seen.observed)
+
+
+@pytest.mark.parametrize(
+    ("feature", "words", "c", "value"),
+    [
+        (1.0, "1", "1.0", 1.0),
+        (away(CAMERA) ** 2, "T^2", "(((x[0] - 44.0) / 20.0) * ((x[0] - 44.0) / 20.0))", 0.25),
+        (0.5 * (CAMERA - AIR) / 2 + POWER, "0.5 (T - air) / 2 + supply", None, 3.5),
+        (away(CAMERA - (AIR + 1)) * 2, "(T - (air + 1)) 2", None, -1.0),
+        (lag(POWER, 60.0) - 1, "supply(1 min) - 1", None, -1.0),
+    ],
+)
+def test_an_expression_in_words_in_c_and_as_a_number(feature, words: str, c: str | None, value: float):
+    at = {CAMERA: 0, AIR: 1, POWER: 2, lag(POWER, 60.0): 3}
+    bound = Origin(44.0, 24.0).bound(feature)
+    assert in_words(feature) == words
+    assert worked_out(bound, at)([34.0, 24.0, 1.0, 0.0]) == value
+    written = in_c(bound, {part: f"x[{place}]" for part, place in at.items()})
+    assert c is None or written == c
+    assert eval(written, {}, {"x": [34.0, 24.0, 1.0, 0.0]}) == pytest.approx(value)
+
+
+def test_what_is_no_expression_is_refused():
+    with pytest.raises(ValueError, match="no expression"):
+        worked_out(play(CAMERA, 3.0), {CAMERA: 0})
