@@ -30,7 +30,6 @@ from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
 from thermostand.stand.config.interface_section import TokenFile
-from thermostand.stand.serving.api.pace import Pace
 from thermostand.stand.serving.api.stream import json_of
 from thermostand.stand.serving.api.token_book import TokenBook
 from thermostand.stand.serving.desk import Who
@@ -47,6 +46,7 @@ CHECK_PATH = "/api/v1/run/plan/check"
 _CHANGES_NOTHING = frozenset({STOP_PATH, INVITE_PATH, CHECK_PATH})
 COOKIE = "thermostand"
 FAILED = "failed ({}); the stand's events say more"  # by what should not happen
+CHUNKS = "a request says how long it is (Content-Length); a body in chunks is not read"
 BODY_LIMIT_BYTES = 1 << 20
 _BODY_LIMIT_S = 10.0
 _LOGIN_S = 600.0
@@ -295,10 +295,9 @@ class Gatekeeper:
     """Before an ASGI application: checks, limits, and the headers of every answer. `failed` is called with what the
     application raises, which is answered with 500."""
 
-    def __init__(self, app: App, access: Access, pace: Pace, failed: Callable[[Exception], None]) -> None:
+    def __init__(self, app: App, access: Access, failed: Callable[[Exception], None]) -> None:
         self._app = app
         self._access = access
-        self._pace = pace
         self._failed = failed
         self._viewers: dict[asyncio.Task[object], Scope] = {}
         access.tokens.watch(self._look_at_viewers)
@@ -315,14 +314,13 @@ class Gatekeeper:
         """One request, or one viewer."""
         if scope["type"] not in ("http", "websocket"):
             return
-        answering = _Answering(send, self._pace, is_last=_is_last(scope))
+        answering = _Answering(send)
         try:
             who = self._access.admit(scope)
             scope["state"] = {**(scope.get("state") or {}), "who": who}
             if scope.get("method") == "HEAD":  # as GET; uvicorn sends the head of its answer only
                 scope = {**scope, "method": "GET"}
             if scope["type"] == "http" and scope["path"] != STOP_PATH:
-                await self._pace.turn()
                 receive = await _whole_body(scope, receive)
             if scope["type"] == "websocket":
                 await self._view(scope, receive, answering)
@@ -333,8 +331,6 @@ class Gatekeeper:
         except Exception as error:  # noqa: BLE001 - after a request that fails, the next must be answered
             self._failed(error)
             await _refuse(scope, answering, 500, FAILED.format(type(error).__name__))
-        finally:
-            self._pace.spent()
 
     async def _view(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As long as its token is known; Denied when that is taken back."""
@@ -352,12 +348,12 @@ class Gatekeeper:
 
 
 class _Answering:
-    """Adds the headers that every answer has, unless the route has given its own. is_last: nothing more is read."""
+    """Adds the headers that every answer has, unless the route has given its own. Each ends its connection: STOP is
+    looked for in what a connection says first (stop_thread.py), and a browser would send it behind what the page has
+    asked for on another one."""
 
-    def __init__(self, send: Send, pace: Pace, *, is_last: bool) -> None:
+    def __init__(self, send: Send) -> None:
         self._send = send
-        self._is_last = is_last
-        self._pace = pace
         self.has_begun = False
 
     async def __call__(self, message: Message) -> None:
@@ -365,8 +361,7 @@ class _Answering:
             own = list(message.get("headers", ()))
             given = {name.lower() for name, _ in own}
             added = [each for each in _HEADERS if each[0] not in given]
-            is_last = self._is_last or self._pace.is_crowded
-            if is_last and message["type"] == "http.response.start" and b"connection" not in given:
+            if message["type"] == "http.response.start" and b"connection" not in given:
                 added.append((b"connection", b"close"))
             message = {**message, "headers": [*own, *added]}
         self.has_begun = self.has_begun or message["type"] != "http.response.body"
@@ -385,19 +380,13 @@ def _is_in_chunks(scope: Scope) -> bool:
     return bool(_all(scope["headers"], b"transfer-encoding"))
 
 
-def _is_last(scope: Scope) -> bool:
-    """Whether a connection ends with this answer. By TCP each does: STOP is looked for in what a connection says first
-    (stop_thread.py), and a browser would send it behind what the page has asked for on another one."""
-    return scope["type"] == "http" and (_is_in_chunks(scope) or (scope.get("state") or {}).get("door") == "tcp")
-
-
 async def _whole_body(scope: Scope, receive: Receive) -> Receive:
     """The body, within its limits, before anything is done for it. Denied when it is longer or slower."""
     if (length := _one(scope["headers"], b"content-length")) is not None:
         if not length.isdecimal() or int(length) > BODY_LIMIT_BYTES:
             raise Denied(413, f"a request has at most {BODY_LIMIT_BYTES} bytes")
     elif _is_in_chunks(scope):
-        raise Denied(411, "a request says how long it is (Content-Length); a body in chunks is not read")
+        raise Denied(411, CHUNKS)
     else:
         return receive
     body = bytearray()
@@ -437,8 +426,6 @@ async def _refuse(scope: Scope, send: _Answering, status: int, sentence: str) ->
         return
     body = json_of({"error": sentence}).encode()
     headers = _headers(status, body)
-    if status in (408, 411, 413):
-        headers.append((b"connection", b"close"))
     await send({"type": f"{prefix}.response.start", "status": status, "headers": headers})
     await send({"type": f"{prefix}.response.body", "body": body})
 

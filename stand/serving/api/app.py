@@ -17,7 +17,6 @@ from thermostand.stand.serving.api.access import FAILED, Access, App, Gatekeeper
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.order_routes import commands
-from thermostand.stand.serving.api.pace import Pace
 from thermostand.stand.serving.api.reads import reads
 from thermostand.stand.serving.api.recorded import recorded
 from thermostand.stand.serving.api.stream import Stream, json_of
@@ -44,7 +43,6 @@ def make_app(
     bridge: Bridge,
     stream: Stream,
     access: Access,
-    pace: Pace,
     interface: Interface,
     failed: Callable[[Exception], None],
 ) -> App:
@@ -69,7 +67,7 @@ def make_app(
     app.add_exception_handler(Exception, _failed)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _refused)
-    return Gatekeeper(cast("App", app), access, pace, failed)
+    return Gatekeeper(cast("App", app), access, failed)
 
 
 # By who may ask (401, 403, 408, 411, 413), by what was asked (400, 422), and by _STATUS.

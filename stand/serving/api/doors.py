@@ -11,7 +11,6 @@ from typing import Any, Literal
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.serving.api.access import is_loopback
 from thermostand.stand.serving.api.bridge import Bridge
-from thermostand.stand.serving.api.pace import Pace
 from thermostand.stand.serving.api.token_book import TokenBook
 
 
@@ -23,7 +22,7 @@ class OtherDoor:
     option: str
     host: str
     port: int
-    serve: Callable[[socket.socket, Bridge, Pace, Callable[[Exception], None]], Coroutine[None, None, None]]
+    serve: Callable[[socket.socket, Bridge, Callable[[Exception], None]], Coroutine[None, None, None]]
 
 
 @dataclass(frozen=True, slots=True)

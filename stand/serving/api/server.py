@@ -24,11 +24,12 @@ from thermostand.foundation.tasks import failure_text
 from thermostand.stand.serving.api.access import Access
 from thermostand.stand.serving.api.bridge import Bridge
 from thermostand.stand.serving.api.doors import Interface, OtherDoor
-from thermostand.stand.serving.api.pace import Pace
-from thermostand.stand.serving.api.stop_thread import StopThread
+from thermostand.stand.serving.api.stop_thread import Door, StopThread
 from thermostand.stand.serving.commands import Served
 from thermostand.stand.serving.presence import Entry, Presence
 
+_UNIX: tuple[Door, ...] = ("socket", "stop")
+_TCP: Door = "tcp"
 _LOOK_S = 1.0
 _CLOSE_LIMIT_S = 5.0
 _READY_LIMIT_S = 30.0
@@ -62,7 +63,7 @@ async def serve(
         raise
     thread = _Thread(bridge, doors, presence, interface, access, stop, report)
     try:
-        for door in ("stop", "tcp"):
+        for door in (*_UNIX, _TCP):
             if door in doors:
                 stop.listen(door, doors[door])
         stop.start()
@@ -186,26 +187,24 @@ class _Thread:
         finally:
             self.is_ready.set()
             for door, listening in self._doors.items():
-                if door not in ("stop", "tcp"):
+                if door not in (*_UNIX, _TCP):
                     listening.close()
 
     async def _main(self) -> None:
         # Imported here: nothing else of the program needs them, and they take half a second.
         from thermostand.stand.serving.api.app import make_app
-        from thermostand.stand.serving.api.listening import Listening
+        from thermostand.stand.serving.api.listening import Clients
         from thermostand.stand.serving.api.stream import Stream
 
-        pace, stream = Pace(), Stream(self._bridge)
-        app = make_app(self._bridge, stream, self._access, pace, self._interface, self._failed)
-        listening = Listening(app, pace)
+        stream = Stream(self._bridge)
+        app = make_app(self._bridge, stream, self._access, self._interface, self._failed)
+        clients = Clients(app)
+        self._stop.hand_over = clients.take
         self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
         if self._is_over.is_set():
             self._ended.set()
-        listening.listen("socket", self._doors["socket"])
-        if "tcp" in self._doors:
-            listening.listen("tcp", self._stop.others)
-        working = [asyncio.create_task(stream.run()), asyncio.create_task(self._look_after(listening))]
-        working += [asyncio.create_task(self._serve(each, pace)) for each in self._interface.doors]
+        working = [asyncio.create_task(stream.run()), asyncio.create_task(self._look_after(clients))]
+        working += [asyncio.create_task(self._serve(each)) for each in self._interface.doors]
         self.is_ready.set()
         try:
             await self._ended.wait()
@@ -213,28 +212,29 @@ class _Thread:
             for task in working:
                 task.cancel()
             await asyncio.gather(*working, return_exceptions=True)
-            await listening.close()
+            await clients.close()
 
-    async def _serve(self, door: OtherDoor, pace: Pace) -> None:
+    async def _serve(self, door: OtherDoor) -> None:
         try:
-            await door.serve(self._doors[door.option], self._bridge, pace, self._failed)
+            await door.serve(self._doors[door.option], self._bridge, self._failed)
         except Exception as error:  # noqa: BLE001 - the other doors stay open
             self._report(NO_CONTROL, f"what {door.option} asked for is not served: {failure_text(error)}")
 
-    async def _look_after(self, listening: Any) -> None:
+    async def _look_after(self, clients: Any) -> None:
         """A logout removes $XDG_RUNTIME_DIR with the sockets that are in it."""
         is_alone = False
         while True:
             await asyncio.sleep(_LOOK_S)
-            listening.look_after()
-            if self._stop.has_failed and not is_alone and "tcp" in self._doors:
+            clients.look_after()
+            if self._stop.has_failed and not is_alone:
                 is_alone = True
-                listening.listen("tcp", self._doors["tcp"])
+                for door in {"socket", "tcp"} & {*self._doors}:
+                    await clients.accept_at(door, self._doors[door])
             if not self._presence.is_there():
                 with suppress(SessionError, StandError):  # tried again the next time
                     self._doors["socket"], self._doors["stop"] = self._presence.appear()
-                    listening.listen("socket", self._doors["socket"])
-                    self._stop.listen("stop", self._doors["stop"])
+                    for door in _UNIX:
+                        self._stop.listen(door, self._doors[door])
 
     def _failed(self, error: Exception) -> None:
         self._report(INTERFACE_FAILED, _failure(error))

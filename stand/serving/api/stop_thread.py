@@ -1,15 +1,16 @@
-"""The thread that serves STOP, and does nothing else for anybody.
+"""The thread at the doors, which serves STOP, and does nothing else for anybody.
 
-It accepts at the TCP port, and at a Unix socket for the command line. What a connection says first is looked at and
-left in the kernel: a request for STOP is answered here, without its body; every other connection is handed over as it
-is. Whatever the others do meanwhile, a STOP waits for this thread's turn only, which is a few system calls. Who says
-nothing makes room for the next.
+It accepts at the TCP port, at the Unix socket, and at another one for the command line's STOP. What a connection says
+first is looked at and left in the kernel: a request for STOP is answered here, without its body; every other connection
+is handed over as it is, once its head is there and there is room for it. Whatever the others do meanwhile, a STOP waits
+for this thread's turn only, which is a few system calls. Who says nothing makes room for the next.
 """
 
 from __future__ import annotations
 
 import concurrent.futures
 import os
+import re
 import select
 import socket
 import threading
@@ -23,6 +24,7 @@ import h11
 from pydantic import BaseModel
 
 from thermostand.stand.serving.api.access import (
+    CHUNKS,
     FAILED,
     STOP_PATH,
     Access,
@@ -33,14 +35,13 @@ from thermostand.stand.serving.api.access import (
     uid_of,
 )
 from thermostand.stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, no_answer
-from thermostand.stand.serving.api.pace import Pace
 from thermostand.stand.serving.desk import Who
 
-Door = Literal["stop", "tcp"]
+Door = Literal["stop", "socket", "tcp"]
 Stopping = Callable[[Who], "concurrent.futures.Future[BaseModel]"]
 
 _MOST_CLIENTS = 128  # of a door, before _AT_ONCE more are let in, who have not been answered or handed over
-_MOST_OTHERS = 64  # handed over, and not taken yet
+_MOST_WAITING = {"tcp": 64, "socket": 256, "stop": 0}  # to be handed over
 _AT_ONCE = 128  # with the rest about 6,000 connections a second, more than most floods of one machine make
 _REST_S = 0.01  # at most, however much is asked of this thread
 _MAY_SPEAK_S = 0.02  # between connecting and speaking, on a busy machine: who is younger is not sent away
@@ -50,77 +51,10 @@ _DRAIN_S = 1.0  # for what a client still sends: closed before it is read, the a
 _LOOK_S = 0.1
 _SPARES = 2
 _REQUEST = f"POST {STOP_PATH}".encode()
+_CHUNKED = re.compile(rb"\n[Tt][Rr][Aa][Nn][Ss][Ff][Ee][Rr]-[Ee][Nn][Cc][Oo][Dd][Ii][Nn][Gg][ \t]*:")
 
 
-class Others:
-    """Connections that want something else, to be accepted as from a listening socket by another thread; without a
-    spare descriptor for this one, accept fails as that of a socket does."""
-
-    def __init__(self) -> None:
-        self._waiting: deque[socket.socket] = deque()
-        self._count = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._lock = threading.Lock()
-        self._spares: list[int] = []
-        self._is_open = True
-        self.keep_spares()
-
-    def fileno(self) -> int:
-        """Readable while one waits."""
-        return self._count
-
-    def accept(self) -> tuple[socket.socket, object]:
-        """The one that has waited longest; BlockingIOError when there is none."""
-        self.keep_spares()
-        with self._lock:
-            if not self._waiting:
-                raise BlockingIOError
-            os.eventfd_read(self._count)
-            return self._waiting.popleft(), None
-
-    def close(self) -> None:
-        """Nobody takes them any more."""
-        with self._lock:
-            if self._is_open:
-                self._is_open = False
-                os.close(self._count)
-            while self._waiting:
-                self._waiting.popleft().close()
-            while self._spares:
-                os.close(self._spares.pop())
-
-    @property
-    def has_room(self) -> bool:
-        """Whether one more may wait."""
-        return self._is_open and len(self._waiting) < _MOST_OTHERS
-
-    def give(self, connection: socket.socket) -> None:
-        """One more, which is closed when nobody takes any."""
-        with self._lock:
-            if self._is_open:
-                self._waiting.append(connection)
-                os.eventfd_write(self._count, 1)
-            else:
-                connection.close()
-
-    def make_room(self) -> bool:
-        """Whether a descriptor was freed."""
-        with self._lock:
-            if self._spares:
-                os.close(self._spares.pop())
-            elif self._waiting:
-                os.eventfd_read(self._count)
-                self._waiting.popleft().close()
-            else:
-                return False
-        return True
-
-    def keep_spares(self) -> None:
-        """OSError when there is no descriptor for one."""
-        while self._is_open and len(self._spares) < _SPARES:
-            self._spares.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
-
-
-def is_readable(listening: socket.socket | Others) -> bool:
+def is_readable(listening: socket.socket) -> bool:
     """Whether somebody waits there: without a descriptor the kernel refuses also when nobody does."""
     poll = select.poll()  # select.select takes no descriptor above 1023
     poll.register(listening, select.POLLIN)
@@ -138,12 +72,13 @@ class _Client:
         self.until_s = now_s + _ASK_WITHIN_S
         self.answer: concurrent.futures.Future[BaseModel] | None = None
         self.has_spoken = False
+        self.waits = False  # to be handed over
         self.has_answer = False
 
     def may_leave(self, now_s: float) -> bool:
         """Whether it makes room for another; a STOP is said as a whole, by all but those who drip."""
         has_time = not self.has_spoken and now_s < self.came_s + _MAY_SPEAK_S
-        return self.has_answer or (self.answer is None and not has_time)
+        return self.has_answer or not (self.answer is not None or self.waits or has_time)
 
     def scope(self, request: h11.Request) -> Scope:
         """Its request, as the gatekeeper gets it."""
@@ -161,12 +96,14 @@ class _Client:
 
 
 class StopThread:
-    """From `start` to `end`; `listen`, `start` and `end` are for any thread. others: who comes by TCP for something
-    else. `stopping` as that of the bridge; `failed` is called with what should not happen."""
+    """From `start` to `end`; `listen`, `start` and `end` are for any thread. hand_over: is given who wants something
+    else, and says whether there is room. `stopping` as that of the bridge; `failed` is called with what should not
+    happen."""
 
     def __init__(self, stopping: Stopping, access: Access, failed: Callable[[Exception], None]) -> None:
-        self.others = Others()
+        self.hand_over: Callable[[Door, socket.socket], bool] = lambda _door, _connection: False
         self.has_failed = False
+        self._spares: list[int] = []
         self._stopping = stopping
         self._access = access
         self._failed = failed
@@ -198,7 +135,6 @@ class StopThread:
         self._is_over.set()
         self._call()
         self._thread.join(within_s)
-        self.others.close()
 
     def _call(self, _: object = None) -> None:
         with self._lock:
@@ -206,12 +142,11 @@ class StopThread:
                 os.eventfd_write(self._called, 1)
 
     def _run(self) -> None:
-        pace = Pace()
         try:
             while not self._is_over.is_set():
                 self._turn()
-                if rest_s := _REST_S if self._is_crowded else min(_REST_S, pace.spent()):
-                    self._is_over.wait(rest_s)
+                if self._is_crowded:
+                    self._is_over.wait(_REST_S)
             self._leave()
         except Exception as error:  # noqa: BLE001 - the framework has a route for STOP, too
             self.has_failed = True
@@ -219,8 +154,10 @@ class StopThread:
         finally:
             for client in self._clients.values():
                 client.connection.close()
+            for spare in self._spares:
+                os.close(spare)
             for door, listening in self._doors.values():
-                if door == "stop" or not self.has_failed:  # whoever accepts at the port now has STOP, too
+                if door == "stop" or not self.has_failed:  # whoever accepts there now has STOP, too
                     listening.close()
             self._epoll.close()
             with self._lock:
@@ -236,7 +173,8 @@ class StopThread:
 
     def _turn(self) -> None:
         """Everybody who has said something, then those who are new."""
-        events = self._epoll.poll(_LOOK_S if self._clients else None)
+        wait_s = _LOOK_S if self._clients else None
+        events = self._epoll.poll(_REST_S if any(each.waits for each in self._clients.values()) else wait_s)
         for number, _ in events:
             if (client := self._clients.get(number)) is not None:
                 self._hear(client)
@@ -277,15 +215,14 @@ class StopThread:
                     continue
                 self._is_crowded = True
                 return
-            with suppress(OSError):
-                self.others.keep_spares()
+            self._keep_spares()
             connection.setblocking(False)
             client = self._clients[connection.fileno()] = _Client(door, connection, time.monotonic())
             self._epoll.register(connection, select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET)
             self._hear(client)  # it has mostly said something by now
 
     def _has_room(self, door: Door) -> bool:
-        clients = [each for each in self._clients.values() if each.door == door]
+        clients = [each for each in self._clients.values() if each.door == door and not each.waits]
         excess, now_s = len(clients) - _MOST_CLIENTS + 1, time.monotonic()
         if excess > 0:
             leaving = [each for each in clients if each.may_leave(now_s)]
@@ -298,17 +235,25 @@ class StopThread:
     def _make_room(self) -> bool:
         """Whether there is a descriptor now, which there was not."""
         silent = [each for each in self._clients.values() if each.answer is None or each.has_answer]
-        if not silent:
-            return self.others.make_room()
-        self._drop(silent[0])
-        return True
+        if silent:
+            with suppress(OSError):
+                silent[0].connection.send(last_refusal(503, "the daemon has no descriptor left, and you said nothing"))
+            self._drop(silent[0])
+        elif self._spares:
+            os.close(self._spares.pop())
+        return bool(silent or self._spares)
+
+    def _keep_spares(self) -> None:
+        with suppress(OSError):  # none to be had now
+            while len(self._spares) < _SPARES:
+                self._spares.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
 
     def _hear(self, client: _Client) -> None:
         try:
             if client.has_answer:
                 if not client.connection.recv(1 << 16):
                     self._drop(client)
-            elif client.answer is None:
+            elif client.answer is None and not client.waits:
                 self._understand(client, client.connection.recv(_HEAD_BYTES, socket.MSG_PEEK))
         except BlockingIOError:
             pass
@@ -322,28 +267,43 @@ class StopThread:
         client.has_spoken = True
         if not said:
             self._drop(client)
-        elif said[: len(_REQUEST)] != _REQUEST[: len(said)]:
-            self._hand_over(client)
-        elif b"\n\r\n" in said or b"\n\n" in said or len(said) == _HEAD_BYTES:
+        elif not (b"\n\r\n" in said or b"\n\n" in said or len(said) == _HEAD_BYTES):
+            return
+        elif said[: len(_REQUEST)] != _REQUEST:
+            self._hand_over(client, said)
+        else:
             parser = h11.Connection(h11.SERVER, max_incomplete_event_size=_HEAD_BYTES - 1)
             parser.receive_data(said)
             try:
                 request = parser.next_event()
             except h11.RemoteProtocolError:
-                self._hand_over(client)
+                self._hand_over(client, said)
                 return
             if isinstance(request, h11.Request):
-                is_stop = request.target.partition(b"?")[0] == STOP_PATH.encode()
-                (self._stop if is_stop else self._hand_over)(client, request)
+                if request.target.partition(b"?")[0] == STOP_PATH.encode():
+                    self._stop(client, request)
+                else:
+                    self._hand_over(client, said)
 
-    def _hand_over(self, client: _Client, _: object = None) -> None:
+    def _hand_over(self, client: _Client, said: bytes) -> None:
+        most = _MOST_WAITING[client.door]
         if client.door == "stop":
             self._answer(client, last_refusal(404, "here is nothing but STOP"))
-        elif not self.others.has_room:
-            self._answer(client, last_refusal(503, f"{_MOST_OTHERS} clients wait already to be let in"))
+        elif _CHUNKED.search(said.partition(b"\n\r\n")[0]):
+            # A megabyte of them, of one byte each, would keep a thread for half a minute.
+            self._answer(client, last_refusal(411, CHUNKS))
+        elif sum(each.waits and each.door == client.door for each in self._clients.values()) >= most:
+            self._answer(client, last_refusal(503, f"{most} clients wait already to be let in"))
         else:
-            self._forget(client)
-            self.others.give(client.connection)
+            client.waits = True
+            self._let_in(client)
+
+    def _let_in(self, client: _Client) -> None:
+        number = client.connection.fileno()
+        if self.hand_over(client.door, client.connection):
+            del self._clients[number]
+            with suppress(OSError):  # it may be closed by now
+                self._epoll.unregister(number)
 
     def _stop(self, client: _Client, request: h11.Request) -> None:
         try:
@@ -365,6 +325,8 @@ class StopThread:
                 self._answer(client, last_refusal(504, str(no_answer(COMMAND_LIMIT_S))))
             elif now_s > client.until_s:
                 self._drop(client)
+            elif client.waits:
+                self._let_in(client)
 
     def _answer(self, client: _Client, answer: bytes) -> None:
         """All of it fits into what the kernel keeps; then what the client still sends is thrown away for a moment."""

@@ -1,6 +1,6 @@
 """The node's TCP port: who is connected, what each has asked and not been answered, and what each follows.
 
-A client has its requests answered in the order of coming, within the budget of all clients; STOP passes both. Of
+A client has its requests answered in the order of coming; STOP passes them. Of
 values that it follows only the newest waits for it, so that a slow one keeps nothing, and one that does not read for a
 while is disconnected. There is always room for one more: the client that was silent longest leaves, strangers first. A
 first line that is no SECoP ends the connection: it may be a browser that was made to send commands here.
@@ -15,7 +15,6 @@ from collections.abc import Callable
 
 from thermostand.stand.serving.api.bridge import Bridge
 from thermostand.stand.serving.api.doors import OtherDoor
-from thermostand.stand.serving.api.pace import Pace
 from thermostand.stand.serving.secop.node import Node, Place
 from thermostand.stand.serving.secop.secop_lines import (
     ANSWERS,
@@ -45,8 +44,8 @@ _FAREWELL_S = 1.0
 def door_at(port: int, *, read_only: bool = False) -> OtherDoor:
     """The node's door, for this machine only. read_only: who comes may look, and order nothing but STOP."""
 
-    async def serve(listening: socket.socket, bridge: Bridge, pace: Pace, failed: Callable[[Exception], None]) -> None:
-        await Door(listening, bridge, pace, failed, read_only=read_only).run()
+    async def serve(listening: socket.socket, bridge: Bridge, failed: Callable[[Exception], None]) -> None:
+        await Door(listening, bridge, failed, read_only=read_only).run()
 
     return OtherDoor("--secop", HOST, port, serve)
 
@@ -58,7 +57,6 @@ class Door:
         self,
         listening: socket.socket,
         bridge: Bridge,
-        pace: Pace,
         failed: Callable[[Exception], None],
         *,
         read_only: bool = False,
@@ -66,7 +64,6 @@ class Door:
         self._listening = listening
         self._read_only = read_only
         self._bridge = bridge
-        self._pace = pace
         self._failed = failed
         self._clients: dict[_Client, asyncio.Task[None]] = {}
         self._ending: set[asyncio.Task[None]] = set()
@@ -112,7 +109,7 @@ class Door:
             self._make_room(MOST_CLIENTS)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            client = _Client(connection, node, self._pace)
+            client = _Client(connection, node)
             self._clients[client] = task = asyncio.create_task(self._serve(client))
             task.add_done_callback(client.close)  # also of one that is sent away before it has begun
 
@@ -143,11 +140,10 @@ class Door:
 
 
 class _Client:
-    def __init__(self, connection: socket.socket, node: Node, pace: Pace) -> None:
+    def __init__(self, connection: socket.socket, node: Node) -> None:
         self.is_stranger = True
         self._connection = connection
         self._node = node
-        self._pace = pace
         self._loop = asyncio.get_running_loop()
         self._heard_s = self._loop.time()
         self._followed: set[str] = set()  # modules
@@ -209,7 +205,7 @@ class _Client:
                 self._too_long()
             if self._is_leaving:
                 return
-            if self._asked.full() or self._pace.spent() > 0.0:
+            if self._asked.full():
                 await asyncio.sleep(_REST_S)
 
     def _too_long(self) -> None:
@@ -256,12 +252,10 @@ class _Client:
     async def _answer(self) -> None:
         while True:
             request = await self._asked.get()
-            await self._pace.turn()
             try:
                 self._give(self._followed_now(request) or await self._node.answer(request))
             except Refusal as refusal:
                 self._refuse(request, refusal)
-            self._pace.spent()
 
     def _followed_now(self, request: Request) -> bytes:
         """The answer to what changes whom it follows, b"" for anything else."""
