@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from thermostand.drivers.camera_preset import CameraPreset
 from thermostand.foundation.addresses import tcp_place
@@ -101,6 +102,10 @@ def _lines_of(config: StandConfig, address_of: Callable[[str | None], str | None
             name: probe.model_dump(include={"protocol", "serial_number"}) | {"address": address_of(probe.address)}
             for name, probe in config.probes.items()
         },
+        "devices": {
+            name: device.model_dump(mode="json") | {"address": address_of(getattr(device, "address", None))}
+            for name, device in config.devices.items()
+        },
         "flap": config.flap
         and {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
     }
@@ -154,23 +159,18 @@ def _chamber_of(config: StandConfig, address_of: Callable[[str | None], str | No
 
 def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
     """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses)."""
+    update: dict[str, Any] = {"bus": config.bus.model_copy(update={"address": addresses["bus"]})}
+    for name, kind, settings in config.equipment:
+        if settings is None or not kind.address_key:
+            continue
+        moved = settings.model_validate({**settings.model_dump(exclude_unset=True), kind.address_key: addresses[name]})
+        if kind.device:
+            update[kind.section] = moved
+        else:
+            update.setdefault(kind.section, {})[name] = moved
     simulation = config.simulation
-    probes = {name: probe.model_copy(update={"address": addresses[name]}) for name, probe in config.probes.items()}
-    axes = {name: axis.model_copy(update={"address": addresses[name]}) for name, axis in config.axes.items()}
-    cameras = {name: each.model_copy(update={"address": addresses[name]}) for name, each in config.cameras.items()}
-    return config.model_copy(
-        update={
-            "bus": config.bus.model_copy(update={"address": addresses["bus"]}),
-            "axes": axes,
-            "probes": probes,
-            "climate_chamber": config.climate_chamber
-            and config.climate_chamber.model_copy(update={"address": addresses["regulator"]}),
-            "flap": config.flap and config.flap.model_copy(update={"backend_address": addresses["flap"]}),
-            "cameras": cameras,
-            "imager": config.imager and config.imager.model_copy(update={"folder": Path(addresses["imager"])}),
-            "simulation": simulation and simulation.model_copy(update={"control": addresses["control"]}),
-        }
-    )
+    update["simulation"] = simulation and simulation.model_copy(update={"control": addresses["control"]})
+    return config.model_copy(update=update)
 
 
 def list_faults() -> list[dict[str, object]]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import cast
 
 from thermostand.drivers.devices.imager.thermal_imager import ThermalImager
 from thermostand.drivers.devices.inputs import Inputs
 from thermostand.drivers.devices.motion.stage import Axis
 from thermostand.drivers.devices.probes import Probe
-from thermostand.drivers.devices.protocols import Actuator, Camera, Controller, Shutter, Switches
+from thermostand.drivers.devices.protocols import Actuator, Camera, Controller, Sensor, Shutter, Switches
 from thermostand.drivers.devices.regulators.heat_module import HeatModule
 from thermostand.drivers.devices.thermometers import SeveralModules, Thermometers
 from thermostand.foundation.clock import Clock
@@ -29,18 +30,48 @@ _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor mus
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """Everything the stand is made of."""
+    """Everything the stand is made of, by name in the order of their ranks; and what its rooms need of that. A relay
+    board and a flap that it lacks have stand-ins."""
 
-    regulator: Controller
-    relays: Switches
-    thermometers: Thermometers | SeveralModules
+    every: Mapping[str, Sensor]
     axes: Mapping[str, Axis]
-    flap: Shutter
     cameras: Mapping[str, Camera]
-    heat_module: HeatModule | None = None
-    inputs: Inputs | None = None
-    imager: ThermalImager | None = None
     probes: Mapping[str, Probe] = field(default_factory=dict[str, Probe])
+
+    @property
+    def regulator(self) -> Controller:
+        """What holds the chamber's temperature."""
+        return cast("Controller", self.every["regulator"])
+
+    @property
+    def relays(self) -> Switches:
+        """What enables heat and cold, and feeds the cameras."""
+        return cast("Switches", self.every["relays"])
+
+    @property
+    def thermometers(self) -> Thermometers | SeveralModules:
+        """The contact thermometers."""
+        return cast("Thermometers | SeveralModules", self.every["thermometers"])
+
+    @property
+    def flap(self) -> Shutter:
+        """What is between the cameras and their target."""
+        return cast("Shutter", self.every["flap"])
+
+    @property
+    def heat_module(self) -> HeatModule | None:
+        """By what a regulator of our own heats; None where that is a relay, or there is no such regulator."""
+        return cast("HeatModule | None", self.every.get("heat_module"))
+
+    @property
+    def inputs(self) -> Inputs | None:
+        """The contacts."""
+        return cast("Inputs | None", self.every.get("inputs"))
+
+    @property
+    def imager(self) -> ThermalImager | None:
+        """The thermal imager."""
+        return cast("ThermalImager | None", self.every.get("imager"))
 
 
 class Stand:

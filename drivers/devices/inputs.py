@@ -7,6 +7,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from thermostand.drivers.devices.checking import Look
+from thermostand.drivers.devices.kinds import Around, DeviceKind
 from thermostand.drivers.settings import DeviceName, Identity, Line, OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
@@ -84,3 +86,31 @@ class Inputs:
             Reading(f"{self.name}.{contact}", float(bits[point]), "1", now_ns)
             for contact, point in self._points.items()
         )
+
+
+def _make(name: str, settings: InputsSettings, around: Around) -> Inputs:
+    channels = {contact: each.channel for contact, each in settings.contacts.items()}
+    return Inputs(name, around.bus, around.map_of("inputs", settings), channels, around.clock)
+
+
+async def _check(look: Look) -> None:
+    """Whether each contact is as it is while all is well."""
+    readings = await look.answers()
+    for name, contact in look.settings.contacts.items():
+        closed = readings.get(name)
+        if closed is not None and (closed == 1) == (contact.fault_when == "closed"):
+            text = f"{name} is {'closed' if closed == 1 else 'open'}, which means {contact.means or 'a fault'}"
+            look.warn(text, "is it so now? else exchange fault_when, or look at its wire")
+
+
+KIND = DeviceKind(
+    name="contacts",
+    settings=InputsSettings,
+    make=_make,
+    section="inputs",
+    device="inputs",
+    rank=40,
+    is_opened=False,
+    address_key="",
+    check=_check,
+)

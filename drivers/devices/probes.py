@@ -17,6 +17,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from thermostand.drivers.devices.kinds import Around, DeviceKind
 from thermostand.drivers.devices.thermometers import Calibration
 from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, same_device
 from thermostand.drivers.wires.line_client import LineClient
@@ -24,7 +25,7 @@ from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.addresses import ByteAddress
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock, call_pause_s
-from thermostand.foundation.errors import Refused, Unreachable
+from thermostand.foundation.errors import DeviceError, Refused, Unreachable
 from thermostand.foundation.readings import Reading, bad_reading
 
 _GAP_S = 0.02
@@ -167,3 +168,16 @@ def _named(data: bytes) -> tuple[str, str, str, str] | None:
     """The four fields of *IDN?."""
     match = _IDENTITY.search(data.decode("latin-1"))
     return None if match is None else (match[1].strip(), match[2].strip(), match[3].strip(), match[4].strip())
+
+
+def _make(name: str, settings: ProbeSettings, around: Around) -> Probe:
+    return Probe(name, settings, around.clock)
+
+
+def _advise(error: DeviceError, name: str, settings: ProbeSettings) -> str:
+    if isinstance(error, Unreachable):
+        return f"is it plugged in and on, and baud as probes.{name} has it? `stand devices` lists the ports"
+    return f"compare probes.{name} with the instrument: its protocol, serial number and unit (degC)"
+
+
+KIND = DeviceKind(name="thermometers", settings=ProbeSettings, make=_make, section="probes", rank=50, advise=_advise)

@@ -8,19 +8,25 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from thermostand.drivers.devices.checking import Look
+from thermostand.drivers.devices.kinds import Around, DeviceKind, Missing
 from thermostand.drivers.settings import Identity, OnBus, PollPeriod_s
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
 from thermostand.drivers.wires.registers import Point, RegisterMap
-from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Unreachable
+from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
 from thermostand.foundation.readings import Reading
 
 COIL_ON = 0xFF00
 COIL_OFF = 0x0000
 MAX_PULSE_COUNTS = 0x7FFF
+HEATER_ENABLE, COMPRESSOR = "heater_enable", "compressor"
 CAMERA_POWER = "camera_power"  # stays on by default: a warm camera is hours of work, and harmless
 HEAT = "heat"  # the output of a software regulator, in pulses
 
+
+WATCHED = (HEATER_ENABLE, COMPRESSOR, HEAT)  # must be off without permission
 
 RelayName = Literal["heater_enable", "compressor", "camera_power", "heat"]
 
@@ -148,3 +154,86 @@ class Relays:
         if channel not in self._points:
             raise ValueError(f"{self.name} has no relay {channel}")
         return self._unit.map.points[self._points[channel]]
+
+
+class NoRelays:
+    """In place of a relay board: the climate chamber enables heat and cold by itself, the cameras always have power.
+
+    A permission to heat is remembered for as long as it was given, so that the guard's rules compare the chamber with
+    it; no wire follows it. camera_power always reads on."""
+
+    has_timer = False
+    identity = None
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        self.name = name
+        self._clock = clock
+        self._until_ns: dict[str, int | None] = {}  # None: for good
+
+    async def open(self) -> None:
+        """Nothing to connect to."""
+
+    async def close(self) -> None:
+        """Nothing to let go of."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """heater_enable, compressor, camera_power; 1 on, 0 off."""
+        now_ns = self._clock.now_ns()
+        states = {HEATER_ENABLE: self._is_on(HEATER_ENABLE), COMPRESSOR: self._is_on(COMPRESSOR), CAMERA_POWER: True}
+        return tuple(Reading(f"{self.name}.{channel}", float(on), "1", now_ns) for channel, on in states.items())
+
+    async def switch(self, channel: str, on: bool) -> None:
+        """Remember it; Refused for a camera that is to be switched off."""
+        if channel == CAMERA_POWER and not on:
+            raise Refused(self.name, "no relay switches the cameras: this stand has no relay board")
+        if on:
+            self._until_ns[channel] = None
+        else:
+            self._until_ns.pop(channel, None)
+
+    async def hold_on(self, channel: str, duration_s: float) -> None:
+        """Remember it for `duration_s` from now."""
+        self._until_ns[channel] = self._clock.now_ns() + seconds_ns(duration_s)
+
+    async def make_safe(self) -> None:
+        """Nothing is permitted any more."""
+        self._until_ns.clear()
+
+    def _is_on(self, channel: str) -> bool:
+        until_ns = self._until_ns.get(channel, 0)
+        return until_ns is None or self._clock.now_ns() < until_ns
+
+
+def _make(name: str, settings: RelaysSettings, around: Around) -> Relays:
+    channels = {str(channel): number for channel, number in settings.channels.items()}
+    return Relays(name, around.bus, around.map_of("relays", settings), channels)
+
+
+async def _check(look: Look) -> None:
+    """Its points, and that nothing is on that should not be."""
+    if look.settings is None:
+        look.opened.add(look.name)
+        text = "no relay board: nothing of this stand's own drops the heat"
+        look.found("link", "ok", text, data={"has_timer": False})
+        return
+    readings = await look.answers()
+    await look.points()
+    for channel in WATCHED:
+        if readings.get(channel) == 1:
+            text = f"{channel} is on, though no program has this stand"
+            look.warn(text, "switch it off at the board, or with `stand check --moves`")
+
+
+KIND = DeviceKind(
+    name="relays",
+    settings=RelaysSettings,
+    make=_make,
+    section="relays",
+    device="relays",
+    rank=10,
+    address_key="",
+    stand_in=NoRelays,
+    stand_in_s=5.0,
+    missing=Missing("relay board", "nothing of the stand's own ends the heat, and cameras stay on"),
+    check=_check,
+)

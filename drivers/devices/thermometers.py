@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
 from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
+from thermostand.drivers.devices.checking import Finding, Look
+from thermostand.drivers.devices.kinds import Around, DeviceKind
+from thermostand.drivers.devices.protocols import Sensor
 from thermostand.drivers.settings import Identity, Line, OnBus, Range
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit, Sample
 from thermostand.drivers.wires.registers import RegisterMap
-from thermostand.foundation.clock import Clock
+from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
 from thermostand.foundation.readings import Quality, Reading, bad_reading
@@ -115,6 +119,11 @@ class Thermometers:
         self.modules = (self,)
 
     @property
+    def unit(self) -> int:
+        """Its number on the bus."""
+        return self._unit.map.transport.unit
+
+    @property
     def identity(self) -> Identity | None:
         """Which module has answered; None before `open`."""
         return self._unit.identity
@@ -194,3 +203,82 @@ class SeveralModules:
     async def read(self) -> tuple[Reading, ...]:
         """Of all modules; DeviceError when one cannot be read."""
         return tuple([reading for module in self.modules for reading in await module.read()])
+
+
+def _make(name: str, settings: ThermometerModuleSettings, around: Around) -> Thermometers | SeveralModules:
+    """Each sensor on the module that has its channel."""
+    sensors = by_channel(around.of_section("thermometers"))
+    first = around.map_of("thermometer_module", settings)
+    count = sum(point.startswith("value_") for point in first.points)
+    if not count:
+        raise ConfigError(
+            f"thermometer_module: register map {first.model} lacks value_0; it is of no thermometer module"
+        )
+    modules: list[Thermometers] = []
+    for number, unit in enumerate(settings.units):
+        here = {
+            sensor: each.model_copy(update={"channel": each.channel - number * count})
+            for sensor, each in sensors.items()
+            if each.channel // count == number or (each.channel // count > number and unit == settings.units[-1])
+        }
+        if not here:
+            raise ConfigError(f"thermometer_module: no thermometer has a channel of unit {unit}")
+        modules.append(Thermometers(name, around.bus, first.at_unit(unit), here, around.clock))
+    return modules[0] if len(modules) == 1 else SeveralModules(modules)
+
+
+_LOOKS, _PERIOD_S = 5, 0.3
+
+
+async def _each_other(thermometers: Sensor, regulator: Sensor | None, warn_K: float, clock: Clock) -> Finding:
+    """How far each is from the median of all, the regulator's own value among them; a warning beyond `warn_K`. In a
+    chamber that has been at rest overnight they all show the same."""
+    seen: dict[str, list[float]] = {}
+    try:
+        for _ in range(_LOOKS):
+            readings = [*await thermometers.read(), *(await regulator.read() if regulator is not None else ())]
+            for reading in readings:
+                device, _, name = reading.channel.partition(".")
+                is_pv = device != thermometers.name
+                if reading.unit == "degC" and reading.quality is Quality.GOOD and (not is_pv or name == "pv"):
+                    seen.setdefault(f"{device} {name}" if is_pv else name, []).append(reading.value)
+            await clock.sleep_until(clock.now_ns() + seconds_ns(_PERIOD_S))
+    except DeviceError as error:
+        return Finding(thermometers.name, "each other", "failed", error.text, "check again once it answers")
+    if len(seen) < 2:
+        text = "fewer than two of them read, so nothing can be compared"
+        return Finding(thermometers.name, "each other", "unverified", text)
+    means = {name: statistics.fmean(values) for name, values in seen.items()}
+    median_degC = statistics.median(means.values())
+    apart_K = {name: mean_degC - median_degC for name, mean_degC in means.items()}
+    data: dict[str, object] = {
+        "median_degC": round(median_degC, 3),
+        "apart_K": {name: round(value, 4) for name, value in apart_K.items()},
+        "noise_K": {name: round(statistics.pstdev(values), 4) for name, values in seen.items()},
+    }
+    farthest = max(apart_K, key=lambda name: abs(apart_K[name]))
+    text = f"{farthest} is {apart_K[farthest]:+.2f} K from the median of all ({median_degC:.2f} degC)"
+    if abs(apart_K[farthest]) > warn_K:
+        advice = "is the chamber at rest? else are two channels exchanged, or is its offset_K wrong?"
+        return Finding(thermometers.name, "each other", "warning", text, advice, data)
+    return Finding(thermometers.name, "each other", "ok", text, data=data)
+
+
+async def _check(look: Look) -> None:
+    """The module, each thermometer, and all of them against each other."""
+    if await look.answers():
+        await look.points(f"value_{each.channel}" for each in look.of_section("thermometers").values())
+        pv = look.made["regulator"] if "regulator" in look.opened else None
+        look.add(await _each_other(look.device, pv, look.of_section("guard").sensors.warn_K, look.clock))
+
+
+KIND = DeviceKind(
+    name="thermometers",
+    settings=ThermometerModuleSettings,
+    make=_make,
+    section="thermometer_module",
+    device="thermometers",
+    rank=30,
+    address_key="",
+    check=_check,
+)

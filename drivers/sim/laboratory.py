@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from thermostand.drivers.sim.fakes import FakeDevice, added_fake
 from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.genicam_file import read_genicam
@@ -78,6 +79,7 @@ class Laboratory:
         self.plant = Plant(plant_spec, self._clock.now_ns())
         self.axes: dict[str, FakeAxis] = {}
         self.probes: dict[str, FakeProbe] = {}
+        self.devices: dict[str, FakeDevice] = {}
         self.thermometer_modules: list[FakeThermometers | FakeAdam4015] = []
         self.cameras: dict[str, FakeCamera] = {}
         self.published: dict[str, PublishedCamera] = {}
@@ -224,6 +226,9 @@ class Laboratory:
         for name, probe in spec.probes.items():
             self.probes[name] = FakeProbe(plant, clock, probe.protocol, probe.serial_number or "P-1", spec.seed)
             self._listen(name, probe.address, self.probes[name].engine)
+        for name, settings in spec.devices.items():
+            self.devices[name] = added_fake(str(settings["kind"]))(plant, clock, settings, spec.seed)
+            self._listen(name, str(settings["address"]), self.devices[name].engine)
         for name, settings in spec.axes.items():
             axis = FakeAxis(plant, clock, settings.stage, settings.serial_number, name)
             self.axes[str(name)] = axis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -107,6 +107,7 @@ class ImagerSpec(Document):
 class LaboratorySpec(Document):
     """What the simulator process reads on its standard input.
 
+    devices: those of other packages, by name, as the stand's file has them, with the address at which each answers.
     Port 0, "serial:" without a path and a camera without an address stand for free ones. All cameras see the same.
     """
 
@@ -135,5 +136,6 @@ class LaboratorySpec(Document):
     flap: EndpointSpec | None
     cameras: dict[str, CameraSpec]
     imager: ImagerSpec | None = None
+    devices: dict[str, dict[str, Any]] = Field(default_factory=dict[str, dict[str, Any]])
     camera_boot_s: float = Field(default=3.0, ge=0)
     faults: tuple[str, ...] = ()

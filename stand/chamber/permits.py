@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from thermostand.drivers.devices.protocols import Switches
-from thermostand.drivers.devices.relays import HEAT
+from thermostand.drivers.devices.relays import COMPRESSOR, WATCHED
+from thermostand.drivers.devices.relays import HEATER_ENABLE as HEATER
 from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import DeviceError, DeviceFault
 from thermostand.foundation.events import (
@@ -33,8 +34,6 @@ from thermostand.foundation.hub import Hub
 from thermostand.stand.chamber.compressor import CompressorState, decide
 from thermostand.stand.config.stand_config import CompressorConfig
 
-HEATER, COMPRESSOR = "heater_enable", "compressor"
-WATCHED = (HEATER, COMPRESSOR, HEAT)  # must be off without permission
 _EARLY_S = 1.0  # a relay that is off so shortly before its time may just have dropped by itself
 
 # The self-test of the dead-man, in units of self_test_s / 3: armed, armed again, must be on, must be off.

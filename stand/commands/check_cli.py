@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from thermostand.drivers.devices.checking import Finding, worst
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.command_app import App
 from thermostand.foundation.documents import read_document
@@ -19,7 +20,6 @@ from thermostand.foundation.output import output, show
 from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.reached import ConfigOption
 from thermostand.stand.commissioning.commissioning import commission
-from thermostand.stand.commissioning.finding import Finding, worst
 from thermostand.stand.commissioning.genicam_rehearsal import rehearse
 from thermostand.stand.commissioning.record import Record
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged

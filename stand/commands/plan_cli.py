@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from thermostand.drivers.devices.cameras.shared_line import camera_lines
 from thermostand.experiments.looks import looks_of
 from thermostand.experiments.steps import Step
 from thermostand.foundation.clock import WallClock, seconds_ns
@@ -26,7 +27,6 @@ from thermostand.stand.commands.reached import (
 )
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.estimating.absent import absences
-from thermostand.stand.estimating.camera_lines import camera_lines
 from thermostand.stand.estimating.estimate import PricedStep
 from thermostand.stand.estimating.learned import load_learned
 from thermostand.stand.estimating.run_estimate import price_night
@@ -64,7 +64,7 @@ def plan(
         f"{len(steps)} steps, {_hours(total_s)}, {totals['frames']} frames, "
         f"{sum(step.size_bytes for step in steps) / 1e9:.2f} GB; started now it ends {local_text(end_ns)}"
     )
-    lines = camera_lines(order.config)
+    lines = camera_lines(order.config.cameras)
     looks = looks_of(step.planned for step in steps)
     data = {
         "steps": [step.as_json() for step in steps],

@@ -33,12 +33,13 @@ async def not_answering(config: StandConfig) -> tuple[str, ...]:
     nothing was asked. ConfigError as `assemble`.
     """
     async with at_bench(config, COMMAND) as assembly:
-        devices = assembly.devices
-        alone: list[Ask] = [each.open for each in (*devices.probes.values(), *devices.axes.values())]
-        if config.flap is not None:
-            alone.append(devices.flap.open)
-        if config.climate_chamber is not None:
-            alone.append(partial(_in_force, devices.regulator))
+        alone: list[Ask] = []
+        for each in assembly.equipment:
+            device = assembly.devices.every[each.name]
+            if each.kind.device == "regulator" and each.kind.address_key:
+                alone.append(partial(_in_force, assembly.devices.regulator))
+            elif each.kind.is_opened and each.kind.address_key and each.settings is not None:
+                alone.append(device.open)
         others = asyncio.gather(*(_asked(ask) for ask in alone))
         (on_bus, is_supplied), lacking = await asyncio.gather(_of_bus(assembly), others)
         cameras = await _of_cameras(config) if is_supplied else ()

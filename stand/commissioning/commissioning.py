@@ -7,18 +7,16 @@ with them everything that moved is made safe at the end, and closed.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AsyncExitStack
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, suppress
 from functools import partial
 
-from thermostand.drivers.devices.protocols import Actuator
+from thermostand.drivers.devices.checking import Add, Finding, Look
+from thermostand.drivers.devices.kinds import Equipment
 from thermostand.drivers.settings import Identity
-from thermostand.foundation.errors import Unreachable
-from thermostand.stand.assembly import Assembly
+from thermostand.foundation.errors import DeviceError, InUse, Unreachable
+from thermostand.stand.assembly import Assembly, register_map
 from thermostand.stand.commissioning import host
-from thermostand.stand.commissioning.camera_line_check import shared_lines
-from thermostand.stand.commissioning.finding import Finding
-from thermostand.stand.commissioning.links import Links
 from thermostand.stand.commissioning.moves import Moves
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.opening.open_stand import at_bench, made_safe
@@ -27,7 +25,6 @@ from thermostand.stand.running.opening.stop import Stop
 COMMAND = "stand check"
 
 Tell = Callable[[tuple[Finding, ...]], None]
-Work = Callable[[], Awaitable[None]]
 
 
 async def commission(
@@ -52,52 +49,63 @@ async def commission(
         return tuple(found), _identities(assembly)
 
 
-async def _looks(assembly: Assembly, add: Callable[[Finding], None], *, has_moves: bool) -> AsyncIterator[None]:
+async def _looks(assembly: Assembly, add: Add, *, has_moves: bool) -> AsyncIterator[None]:
     """Yields after each device."""
     for finding in await asyncio.to_thread(host.findings, assembly.config):
         add(finding)
     yield
-    devices, links = assembly.devices, Links(assembly, add)
-    moves = Moves(assembly, links, add) if has_moves else None
-
-    async def look(link: Work, actuator: Actuator | None = None, move: Work | None = None) -> None:
-        await link()
-        if moves is None:
-            return
-        if actuator is not None and actuator.name in links.opened:
-            assembly.stand.opened(actuator)
-        if move is not None:
-            await move()
-
-    await look(links.bus)
+    opened: set[str] = set()
+    moves = Moves(assembly, opened, add) if has_moves else None
+    is_bus_up = await _is_bus_up(assembly, add)
     yield
-    await look(links.regulator, devices.regulator)
-    yield
-    await look(links.thermometers)
-    yield
-    await look(links.relays, devices.relays, moves and moves.heat_timer)
-    yield
-    await look(links.heat_module)
-    yield
-    await look(links.inputs)
-    yield
-    for name in devices.probes:
-        await links.probe(name)
+    for each in assembly.equipment:
+        name, kind, settings = each
+        device = assembly.devices.every[name]
+        await kind.check(
+            Look(
+                device=device,
+                settings=settings,
+                section=kind.section,
+                advise=partial(_advised, each),
+                clock=assembly.clock,
+                bus=assembly.bus,
+                is_bus_up=is_bus_up,
+                made=assembly.devices.every,
+                opened=opened,
+                of_section=partial(getattr, assembly.config),
+                map_of=register_map,
+                add=add,
+                is_powered_later=has_moves,
+            )
+        )
+        if moves is not None:
+            await moves.of(each)
         yield
-    await links.imager()
-    yield
-    await look(links.flap, devices.flap, moves and moves.flap)
-    yield
-    for name, axis in devices.axes.items():
-        await look(partial(links.axis, name), axis, moves and partial(moves.axis, name))
-        yield
-    for name in devices.cameras:
-        await links.camera(name, is_switched_on_later=has_moves)
-        for finding in shared_lines(assembly.config, name):
-            add(finding)
     if moves is not None:
         await moves.cameras()
-    yield
+        yield
+
+
+def _advised(each: Equipment, error: DeviceError) -> str:
+    return each.kind.advise(error, each.name, each.settings)
+
+
+async def _is_bus_up(assembly: Assembly, add: Add) -> bool:
+    """The line that the units share."""
+    try:
+        await assembly.bus.open()
+    except DeviceError as error:
+        if isinstance(error, InUse):
+            advice = "end the other program"
+        elif assembly.config.simulation is not None:
+            advice = "this stand is simulated: start its laboratory with `stand simulate FILE` in another terminal"
+        else:
+            advice = "is the adapter plugged in, its address right, and no other program using it? `stand devices`"
+            advice += " lists the ports"
+        add(Finding("bus", "link", "failed", error.text, advice))
+        return False
+    add(Finding("bus", "link", "ok", f"{assembly.bus.address} is open"))
+    return True
 
 
 async def _made_safe(assembly: Assembly, stop: Stop, found: list[Finding], tell: Tell) -> None:
@@ -110,14 +118,9 @@ async def _made_safe(assembly: Assembly, stop: Stop, found: list[Finding], tell:
 
 def _identities(assembly: Assembly) -> dict[str, Identity]:
     """Of those that have answered."""
-    devices = assembly.devices
     known: dict[str, Identity] = {}
-    units = (devices.regulator, devices.relays, devices.heat_module, devices.thermometers, devices.inputs, devices.flap)
-    for device in (*units, *devices.axes.values(), *devices.cameras.values()):
-        try:
-            identity = None if device is None else device.identity
-        except Unreachable:  # a camera that is not open
-            continue
-        if device is not None and identity is not None:
-            known[device.name] = identity
+    for name, device in assembly.devices.every.items():
+        with suppress(Unreachable):  # a camera that is not open
+            if device.identity is not None:
+                known[name] = device.identity
     return known

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import time
 
-from thermostand.stand.commissioning.finding import Finding
+from thermostand.drivers.devices.checking import Finding
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.run_estimate import existing
 

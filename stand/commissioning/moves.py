@@ -7,17 +7,18 @@ is held for some seconds while the permissions are withdrawn and the regulator i
 from __future__ import annotations
 
 from collections.abc import Awaitable
+from typing import cast
 
-from thermostand.drivers.devices.protocols import Camera
+from thermostand.drivers.devices.cameras.cameras_by_protocol import check_settings
+from thermostand.drivers.devices.checking import Add, Finding, identity_finding
+from thermostand.drivers.devices.kinds import Equipment
+from thermostand.drivers.devices.protocols import Actuator, Camera
 from thermostand.foundation.clock import NS_PER_S, Clock
 from thermostand.foundation.errors import DeviceError, StandError, StandTripped, Superseded
 from thermostand.foundation.events import DEAD_MAN_TESTED, HOME_RESIDUAL, HOME_RESIDUAL_LARGE
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Quality
 from thermostand.stand.assembly import Assembly
-from thermostand.stand.commissioning import advice
-from thermostand.stand.commissioning.finding import Add, Finding
-from thermostand.stand.commissioning.links import Links, identity_finding
 
 _FRAMES = 6
 _SLOW = 0.8  # of the longest travel that the stand's file allows
@@ -25,20 +26,32 @@ _MOST_APART_K = 10.0  # a chamber so far from its laboratory keeps its flap shut
 
 
 class Moves:
-    """Of the devices that answer (`links.opened`); each says what it found."""
+    """Of the devices that answer, by their names in `opened`; each says what it found."""
 
-    def __init__(self, assembly: Assembly, links: Links, add: Add) -> None:
+    def __init__(self, assembly: Assembly, opened: set[str], add: Add) -> None:
         self._assembly = assembly
-        self._links = links
+        self._opened = opened
         self._add = add
         self._events: list[Event] = []
         assembly.hub.subscribe(self._follow)
+
+    async def of(self, each: Equipment) -> None:
+        """What moves of this device; from now on it is made safe at the end."""
+        device = self._assembly.devices.every[each.name]
+        if each.name in self._opened and hasattr(device, "make_safe"):
+            self._assembly.stand.opened(cast("Actuator", device))
+        if each.kind.device == "regulator":
+            await self.heat_timer()
+        elif device is self._assembly.devices.flap:
+            await self.flap()
+        elif each.name in self._assembly.devices.axes:
+            await self.axis(each.name)
 
     async def heat_timer(self) -> None:
         """Does the board drop the heater's relay in time, and does a timed-on sent again start its time again?"""
         stand, devices = self._assembly.stand, self._assembly.devices
         name, what = devices.relays.name, "timed-on"
-        if not {name, devices.regulator.name} <= self._links.opened:
+        if not {name, devices.regulator.name} <= self._opened:
             text = "not measured, since relay board and regulator do not both answer"
             self._add(Finding(name, what, "unverified", text, "mend them, and check again"))
             return
@@ -63,7 +76,7 @@ class Moves:
     async def flap(self) -> None:
         """Open and close, each with its time."""
         name, flap = self._assembly.devices.flap.name, self._assembly.config.flap
-        if flap is None or name not in self._links.opened:
+        if flap is None or name not in self._opened:
             return
         if apart_K := await self._chamber_apart_K():
             text = f"not moved: the chamber is {apart_K:+.0f} K from the laboratory"
@@ -79,7 +92,7 @@ class Moves:
         except Superseded:
             raise
         except DeviceError as error:
-            self._add(Finding(name, "travel", "failed", error.text, advice.for_flap(error)))
+            self._add(Finding(name, "travel", "failed", error.text, self._advice(error, name)))
             return
         data: dict[str, object] = {"open_s": open_s, "close_s": close_s, "travel_s": travel_s}
         text = f"opens in {open_s:.1f} s, closes in {close_s:.1f} s"
@@ -91,7 +104,7 @@ class Moves:
 
     async def axis(self, name: str) -> None:
         """Home; one that had a home before tells how far it was off, and goes back to where it was."""
-        if name not in self._links.opened:
+        if name not in self._opened:
             return
         stand, axis = self._assembly.stand, self._assembly.devices.axes[name]
         try:
@@ -104,7 +117,7 @@ class Moves:
         except Superseded:
             raise
         except DeviceError as error:
-            self._add(Finding(name, "home", "failed", error.text, advice.for_axis(error, name)))
+            self._add(Finding(name, "home", "failed", error.text, self._advice(error, name)))
             return
         if not was_homed:
             text = f"homed in {took_s:.1f} s; it had no home before, so there is nothing to compare"
@@ -122,7 +135,7 @@ class Moves:
         """Frames as fast as they come, and the temperature behind them; a supply that was off is off again at the
         end, also when an operator breaks the check off: it is then made safe with what moved."""
         stand = self._assembly.stand
-        if not self._assembly.devices.cameras or self._assembly.devices.relays.name not in self._links.opened:
+        if not self._assembly.devices.cameras or self._assembly.devices.relays.name not in self._opened:
             return  # there are none, or that their relay does not answer was reported
         try:
             await self._supplied_cameras()
@@ -138,14 +151,14 @@ class Moves:
             raise
         except DeviceError as error:
             name = error.device if error.device in devices.cameras else next(iter(devices.cameras))
-            to_do = advice.for_camera(error, name, self._assembly.config.cameras[name].address)
+            to_do = self._advice(error, name)
             self._add(Finding(name, "link", "failed", error.text, to_do))
             return
         for name, camera in devices.cameras.items():
-            if name not in self._links.opened:
-                self._links.opened.add(name)
+            if name not in self._opened:
+                self._opened.add(name)
                 self._add(identity_finding(camera))
-                await self._links.camera_settings(camera)
+                await check_settings(camera, self._add)
             await self._frames(name, camera)
         if supply.was_on is False:
             await supply.switch_off()
@@ -159,8 +172,7 @@ class Moves:
             took_s = (self._assembly.clock.now_ns() - begin_ns) / NS_PER_S
             temperature, *_ = await camera.read()
         except DeviceError as error:
-            address = self._assembly.config.cameras[name].address
-            self._add(Finding(name, "frames", "failed", error.text, advice.for_camera(error, name, address)))
+            self._add(Finding(name, "frames", "failed", error.text, self._advice(error, name)))
             return
         rate_hz, dropped = _FRAMES / took_s, sum(frame.dropped for frame in frames)
         megabytes = first.image.nbytes / 1e6
@@ -186,7 +198,7 @@ class Moves:
     async def _chamber_apart_K(self) -> float:
         """How far the chamber's air is from the laboratory; 0 when it is near, or not known."""
         devices = self._assembly.devices
-        if devices.thermometers.name not in self._links.opened:
+        if devices.thermometers.name not in self._opened:
             return 0.0
         try:
             readings = {each.channel.partition(".")[2]: each for each in await devices.thermometers.read()}
@@ -197,6 +209,10 @@ class Moves:
             return 0.0
         apart_K = air.value - outside.value
         return apart_K if abs(apart_K) > _MOST_APART_K else 0.0
+
+    def _advice(self, error: DeviceError, name: str) -> str:
+        each = next(each for each in self._assembly.equipment if each.name == name)
+        return each.kind.advise(error, name, each.settings)
 
     def _follow(self, item: Item) -> None:
         if isinstance(item, Event):

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from thermostand.drivers.devices.checking import Finding, Verdict, worst
 from thermostand.drivers.settings import Identity
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.files import write_whole
-from thermostand.stand.commissioning.finding import Finding, Verdict, worst
 from thermostand.stand.config.checked import digest, record_files
 from thermostand.stand.config.stand_config import StandConfig
 

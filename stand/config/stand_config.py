@@ -11,13 +11,23 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, Self, cast
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    SerializeAsAny,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
 
 from thermostand.drivers.camera_preset import CameraPreset
 from thermostand.drivers.devices.cameras.cameras_by_protocol import AnyCameraSettings
 from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
 from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings
 from thermostand.drivers.devices.inputs import InputsSettings
+from thermostand.drivers.devices.kinds import Equipment, added_settings, built_in, equipment_of
 from thermostand.drivers.devices.motion.flap import FlapSettings
 from thermostand.drivers.devices.motion.stage import AxisSettings
 from thermostand.drivers.devices.probes import ProbeSettings
@@ -26,7 +36,7 @@ from thermostand.drivers.devices.regulators.pid import split
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from thermostand.drivers.devices.relays import HEAT, RelaysSettings
 from thermostand.drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings, by_channel
-from thermostand.drivers.settings import CameraSettings, DeviceName, Line, OnBus, ascending
+from thermostand.drivers.settings import CameraSettings, DeviceName, Line, OnBus, Polled, ascending
 from thermostand.drivers.wires.bus import BusSettings
 from thermostand.experiments.parameters import Chamber_degC
 from thermostand.foundation.documents import Document, load_document
@@ -56,21 +66,13 @@ RegulatorSettings = Annotated[
         custom_error_message="must have kind: software, or no kind and the registers of a unit on the bus",
     ),
 ]
+AddedDevice = Annotated[
+    SerializeAsAny[Polled],
+    BeforeValidator(added_settings),
+    WithJsonSchema({"type": "object", "properties": {"kind": {"type": "string"}}, "required": ["kind"]}),
+]
 Folder = Literal["", "registers", "recipes", "targets", "optics"]
-MAPPED = ("regulator", "heat_module", "relays", "thermometer_module")  # the devices that have a register map
 LEADING = "camera"  # the camera by whose temperature soaks, cool-downs and models go
-_DEVICES = (
-    "bus",
-    "regulator",
-    "heat_module",
-    "relays",
-    "thermometers",
-    "flap",
-    "stand",
-    "control",
-    "inputs",
-    "imager",
-)  # names that are taken
 
 
 class LimitsConfig(Document):
@@ -117,7 +119,7 @@ class RecordingConfig(Document):
 class StandConfig(Document):
     """The whole file. What holds the chamber's temperature is a regulator, a unit on the bus or (kind: software) ours,
     with a relay board that enables its heat, or a climate_chamber with a controller of its own, which needs none. Ours
-    heats by a relay of that board, or by a heat_module, an analog output."""
+    heats by a relay of that board, or by a heat_module, an analog output. devices: of kinds that other packages add."""
 
     name: Line = Field(min_length=1)
     operator: Line = ""
@@ -135,6 +137,7 @@ class StandConfig(Document):
     inputs: InputsSettings | None = None
     imager: ThermalImagerSettings | None = None
     cameras: dict[DeviceName, AnyCameraSettings] = Field(default_factory=dict)
+    devices: dict[DeviceName, AddedDevice] = Field(default_factory=dict)
     chamber: ChamberConfig = ChamberConfig()
     limits: LimitsConfig = LimitsConfig()
     guard: GuardConfig = GuardConfig()
@@ -238,16 +241,17 @@ class StandConfig(Document):
         others = [each.unit for each in (regulator, self.heat_module) if each is not None]
         if self.inputs is not None and self.inputs.unit in (*others, *self.thermometer_module.units):
             yield "inputs.unit is that of the regulator or the thermometers; take the relay board's, or another"
-        addresses = [self.bus.address, *(each.address for each in (*self.axes.values(), *self.probes.values()))]
-        addresses += [self.climate_chamber.address] if self.climate_chamber is not None else []
-        addresses += [camera.address for camera in self.cameras.values()]
+        equipment = self.equipment
+        there = [place for each in equipment if each.settings is not None for place in each.kind.places(each.settings)]
+        addresses = [self.bus.address, *(place.text for place in there if place.how in ("wire", "host"))]
         if twice := [address for address in addresses if addresses.count(address) > 1]:
-            yield f"bus, axes, probes and cameras need addresses of their own, {twice[0]} is given twice"
+            yield f"bus and devices need addresses of their own, {twice[0]} is given twice"
         if unknown := [] if self.simulation is None else sorted(set(self.simulation.cameras) - set(self.cameras)):
             yield f"simulation.cameras has {unknown[0]}, and no camera of the stand is named so"
-        names = [*self.axes, *self.cameras, *self.probes, *_DEVICES]
+        taken = {"bus", "stand", "control", *(kind.device for kind in built_in())}
+        names = [*(each.name for each in equipment if not each.kind.device), *taken]
         if twice := [name for name in names if names.count(name) > 1]:
-            yield f"the name {twice[0]} is that of two devices; axes, cameras and probes need names of their own"
+            yield f"the name {twice[0]} is that of two devices; each needs one of its own"
         if len({entry.channel for entry in self.thermometers.values()}) < len(self.thermometers):
             yield "thermometers: two thermometers share one channel"
         if self.cameras and LEADING not in self.cameras:
@@ -314,6 +318,16 @@ class StandConfig(Document):
         rates = (each.ambient_K_per_min for each in self.cameras.values())
         return min((rate for rate in rates if rate is not None), default=math.inf)
 
+    @property
+    def equipment(self) -> tuple[Equipment, ...]:
+        """Every device, in the order in which they are opened, and what is in the place of those that it lacks."""
+        return equipment_of(self, self.devices)
+
+    @property
+    def units(self) -> dict[str, OnBus]:
+        """The units on the bus, which have a register map, by their sections."""
+        return {each.kind.section: each.settings for each in self.equipment if isinstance(each.settings, OnBus)}
+
     def accepted(self) -> dict[str, float]:
         """The values outside their safe ranges, which guard.accept names, by their paths."""
         return outside(self, self.thermometers)
@@ -345,8 +359,7 @@ def load_config(path: Path) -> StandConfig:
     simulation = config.simulation and config.simulation.model_copy(
         update={"cameras": {name: _dressed(path, each) for name, each in config.simulation.cameras.items()}}
     )
-    named: dict[str, object] = {name: getattr(config, name) for name in (*MAPPED, "inputs")}
-    units = {name: unit for name, unit in named.items() if isinstance(unit, OnBus)}
+    units = config.units
     return config.model_copy(
         update={
             name: unit.model_copy(update={"registers": _beside(path, unit.registers)}) for name, unit in units.items()

@@ -12,10 +12,11 @@ from collections.abc import AsyncGenerator, Callable, Iterator, Mapping, Sequenc
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import cast
 
 from pydantic import JsonValue
 
-from thermostand.drivers.devices.protocols import Sensor
+from thermostand.drivers.devices.protocols import Actuator, Sensor
 from thermostand.drivers.settings import OnBus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
 from thermostand.foundation.clock import WallClock, seconds_ns
@@ -25,7 +26,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Reading
 from thermostand.foundation.repeats import RepeatLimit
 from thermostand.recording.format.images import encode_png
-from thermostand.stand.assembly import Assembly, assemble, device_kinds, register_map
+from thermostand.stand.assembly import Assembly, assemble, register_map
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.daemon.by_hand import ByHand
 from thermostand.stand.running.opening.open_stand import at_bench, made_safe
@@ -35,7 +36,6 @@ from thermostand.stand.serving.desk import Argument, Conflict, DeviceState, Devi
 COMMAND = "stand device"
 READ, REGISTERS, GRAB = "read", "registers", "grab"
 _OPEN_S = 10.0  # that a flap stays open
-_KEYS = {"thermometers": "thermometer_module"}  # of the stand's file, where it is not the device's name
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ def known_devices(config: StandConfig) -> tuple[DeviceState, ...]:
 def _looks(config: StandConfig, device: DeviceState) -> Iterator[DeviceVerb]:
     """What a device takes by hand besides what it takes of a daemon."""
     yield DeviceVerb(verb=READ, text="what it reads")
-    if _unit_of(config, device.name) is not None:
+    if any(each.name == device.name and isinstance(each.settings, OnBus) for each in config.equipment):
         yield DeviceVerb(verb=REGISTERS, text="every point of its register map")
     if device.kind == "camera":
         exposure, flap = Argument(name="exposure_s", unit="s"), Argument(name="flap", choices=("open",))
@@ -97,7 +97,7 @@ class _Hands:
 
     def __init__(self, assembly: Assembly) -> None:
         self.assembly = assembly
-        self._kinds = device_kinds(assembly.config)
+        self._equipment = {each.name: each for each in assembly.equipment}
 
     def check(self, name: str, verb: str) -> None:
         """ConfigError when there is no such device, or it does not know that; nothing was opened then."""
@@ -110,32 +110,20 @@ class _Hands:
 
     async def opened(self, name: str) -> Sensor:
         """The device, with what it needs."""
-        assembly, devices = self.assembly, self.assembly.devices
-        kind = self._kinds[name]
-        units = (devices.relays, devices.thermometers, devices.regulator, devices.heat_module, devices.inputs)
-        on_bus: dict[str, Sensor] = {unit.name: unit for unit in units if unit is not None}
-        if devices.imager is not None and name == devices.imager.name:
-            return await self._open(devices.imager)
-        if kind == "camera":
+        assembly, (_, kind, _) = self.assembly, self._equipment[name]
+        if not kind.address_key or kind.section == "cameras":
             await assembly.bus.open()
-            await self._open(devices.relays)
+        if kind.section == "cameras":
+            await assembly.devices.relays.open()
             supply = assembly.stand.imaging.supply
             await supply.switch_on()
             if supply.was_on is False:
                 assembly.stand.safety.take(supply)
-            return devices.cameras[name]
-        if name in on_bus:
-            await assembly.bus.open()
-            return await self._open(on_bus[name])
-        if name in devices.probes:
-            return await self._open(devices.probes[name])
-        mover = devices.axes.get(name, devices.flap)
-        await mover.open()
-        assembly.stand.opened(mover)
-        return mover
-
-    async def _open(self, device: Sensor) -> Sensor:
+            return assembly.devices.cameras[name]
+        device = assembly.devices.every[name]
         await device.open()
+        if kind.address_key and kind.device != "regulator" and hasattr(device, "make_safe"):
+            assembly.stand.opened(cast("Actuator", device))
         return device
 
     async def grab(self, name: str, arguments: Mapping[str, JsonValue], out: Path | None) -> Done:
@@ -197,17 +185,12 @@ def _readings(readings: Sequence[Reading]) -> Done:
     return Done(lines or ["it reads nothing"], [asdict(each) for each in readings])
 
 
-def _unit_of(config: StandConfig, name: str) -> OnBus | None:
-    settings = getattr(config, _KEYS.get(name, name), None)
-    return settings if isinstance(settings, OnBus) else None
-
-
 async def _registers(assembly: Assembly, name: str) -> Done:
     """Every point of the unit's register map, read one by one; what cannot be read says why."""
-    settings = _unit_of(assembly.config, name)
-    if settings is None:
+    _, kind, settings = next(each for each in assembly.equipment if each.name == name)
+    if not isinstance(settings, OnBus):
         raise ConfigError(f"{name} has no registers; the units on the bus have")
-    found = register_map(_KEYS.get(name, name), settings)
+    found = register_map(kind.section, settings)
     unit = ModbusUnit(name, assembly.bus, found)
     lines: list[str] = []
     data: dict[str, object] = {}

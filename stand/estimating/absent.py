@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from thermostand.drivers.devices.kinds import built_in
 from thermostand.stand.config.stand_config import StandConfig
 
 
@@ -24,15 +25,11 @@ def absences(config: StandConfig) -> tuple[Absence, ...]:
 
 
 def _absences(config: StandConfig) -> Iterator[Absence]:
-    if config.flap is None:
-        yield Absence("flap", "cameras see the target all the time; what opens or closes it takes no time")
-    if not config.axes:
-        yield Absence("stages", "a recipe that moves one is refused")
-    if not config.cameras:
-        yield Absence("cameras", "a recipe that takes frames is refused")
-    if config.relays is None:
-        yield Absence("relay board", "nothing of the stand's own ends the heat, and cameras stay on")
-    elif "compressor" not in config.relays.channels:
+    there = {each.kind for each in config.equipment if each.settings is not None}
+    for kind in built_in():
+        if kind.missing is not None and kind not in there:
+            yield Absence(*kind.missing)
+    if config.relays is not None and "compressor" not in config.relays.channels:
         yield Absence("compressor", "it cools by losing heat only, so not below the laboratory's temperature")
     if config.cameras and all(not camera.has_temperature for camera in config.cameras.values()):
         yield Absence("camera measures its own temperature", "drift is fitted to the air and its history")

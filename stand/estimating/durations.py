@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
+from thermostand.drivers.devices.cameras.shared_line import overloaded
 from thermostand.drivers.devices.motion.stage import AxisSettings
 from thermostand.drivers.devices.motion.stage_profiles import StageProfile
 from thermostand.experiments.steps import KnownStand, Price, Situation, Step
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.estimating.camera_lines import overloaded
 from thermostand.stand.estimating.chamber_model import ChamberModel
 
 
@@ -101,7 +101,7 @@ class ConfiguredStand(KnownStand):
             return f"this stand has no camera {unknown[0]}; it has {', '.join(known) or 'none'}"
         if interval_s is None:
             return ""
-        if reason := overloaded(self._config, interval_s):
+        if reason := overloaded(self._config.cameras, interval_s):
             return reason
         for name, camera in known.items():
             if interval_s < 1 / camera.frame_rate_hz - 1e-9:

@@ -212,15 +212,7 @@ def _minutes(duration_s: float) -> str:
 
 
 def _messages_per_s(config: StandConfig) -> float:
-    polled = (config.regulator, config.climate_chamber, config.relays, config.heat_module, config.flap)
-    polled = (
-        *polled,
-        config.thermometer_module,
-        *config.cameras.values(),
-        *config.axes.values(),
-        *config.probes.values(),
-    )
-    return sum(1.0 / device.poll_s for device in polled if device is not None)
+    return sum(1.0 / each.poll_s for each in config.equipment if each.settings is not None and each.poll_s is not None)
 
 
 def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:

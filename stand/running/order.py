@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from thermostand.drivers.settings import OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.experiments.sequence import faults
 from thermostand.experiments.steps import PlannedStep
@@ -15,10 +14,10 @@ from thermostand.foundation.documents import parse_document, read_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.markers.target import Target
-from thermostand.stand.assembly import bus_units, inputs_of
+from thermostand.stand.assembly import make_devices
 from thermostand.stand.config.checked import ATTACHMENT, load_checked
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import MAPPED, StandConfig, load_config, packaged
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.estimating.durations import ConfiguredStand
 from thermostand.stand.estimating.estimate import check_step, price
 
@@ -83,18 +82,15 @@ def with_register_maps(order: Order) -> Order:
     texts = register_texts(order.config)
     clock = WallClock()
     bus = Bus("bus", order.config.bus, clock)
-    bus_units(order.config, bus, Hub(), clock)
-    inputs_of(order.config, bus, clock)
+    make_devices(order.config, bus, Hub(), clock)
     return replace(order, register_texts=texts)
 
 
 def register_texts(config: StandConfig) -> dict[str, str]:
     """The register maps of a stand as they are now, by names of attachments; ConfigError when one is missing."""
-    units = {name: getattr(config, name) for name in (*MAPPED, "inputs")}
     return {
         _REGISTERS.format(name): read_document(packaged("registers", unit.registers, key=f"{name}.registers"))
-        for name, unit in units.items()
-        if isinstance(unit, OnBus)
+        for name, unit in config.units.items()
     }
 
 
@@ -146,7 +142,7 @@ def parse_order(texts: Mapping[str, str], names: Mapping[str, str]) -> Order:
         texts["config.yaml"],
         texts["recipe.yaml"],
         texts["target.yaml"],
-        register_texts={name: texts[name] for name in map(_REGISTERS.format, (*MAPPED, "inputs")) if name in texts},
+        register_texts={name: texts[name] for name in map(_REGISTERS.format, config.units) if name in texts},
         optics_texts=attached_optics(config, texts),
         commissioning_text=texts.get(ATTACHMENT, ""),
     )

@@ -44,6 +44,10 @@ def rehearsed(order: Order) -> Order:
             name: probe.model_copy(update={"address": f"tcp:127.0.0.1:{_PROBES + number}"})
             for number, (name, probe) in enumerate(config.probes.items())
         },
+        "devices": {
+            name: device.model_copy(update={"address": f"tcp:127.0.0.1:{_PROBES + len(config.probes) + number}"})
+            for number, (name, device) in enumerate(config.devices.items())
+        },
         "flap": config.flap and _flap(config.flap, there.flap),
         "cameras": {name: _camera(camera, there.cameras["camera"]) for name, camera in config.cameras.items()},
         "guard": config.guard.model_copy(update={"notify": ()}),

@@ -18,6 +18,7 @@ from thermostand.foundation.events import ABSENT, SEARCH_FAILED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.markers.target import Target
+from thermostand.recording.format.kinds import KINDS
 from thermostand.recording.format.roi import RoiEncoder
 from thermostand.recording.writing.disk import Disk
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
@@ -60,10 +61,9 @@ def tell_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
     """Which devices have answered, as events, but for the cameras, which are reported when they are on; and what the
     stand lacks. tell: gets them."""
     devices, now_ns = assembly.devices, assembly.clock.now_ns()
-    units = (devices.regulator, devices.relays, devices.heat_module, devices.thermometers, devices.inputs, devices.flap)
-    for device in (*units, *devices.axes.values(), *devices.probes.values()):
-        if device is not None and device.identity is not None:
-            tell(identity_event(device.name, device.identity, now_ns))
+    for name, device in devices.every.items():
+        if name not in devices.cameras and device.identity is not None:
+            tell(identity_event(name, device.identity, now_ns))
     for absence in absences(assembly.config):
         tell(ABSENT.at(now_ns, absence.means, what=absence.what))
 
@@ -98,8 +98,7 @@ def recorder_in(
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
-    # Contacts are kept as those of the relays.
-    kinds = {name: "relays" if kind == "contacts" else kind for name, kind in device_kinds(config).items()}
+    kinds = {name: kind if kind in KINDS else "relays" for name, kind in device_kinds(config).items()}
     return Recorder(directory, info, attachments, kinds, hub, clock, settings, encode, disk)
 
 

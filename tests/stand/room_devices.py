@@ -172,12 +172,10 @@ class Rooms:
         self.regulator, self.relays = Regulator("regulator", *here), Relays("relays", *here)
         self.flap, self.camera, self.linear = Flap("flap", *here), Camera("camera", *here), Stage("linear", *here)
         # Duck-typed on purpose: the stand takes the drivers' classes, and these speak to no wire.
-        parts = cast("dict[str, Any]", {each.name: each for each in (self.regulator, self.relays, self.flap)})
         devices = Devices(
-            thermometers=cast("Any", None),
+            cast("dict[str, Any]", {each.name: each for each in (self.regulator, self.relays, self.flap)}),
             axes={"linear": cast("Any", self.linear)},
             cameras={"camera": cast("Any", self.camera)},
-            **parts,
         )
         chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, COMPRESSOR_LIMITS), 5.0, None, K_per_min)
         self.stand = Stand(devices, chamber, SupplyLimits(2.0, 15.0), self.hub, self.clock)

@@ -6,6 +6,8 @@ import pytest
 import yaml
 
 from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.cameras_by_protocol import line_findings
+from thermostand.drivers.devices.cameras.shared_line import camera_lines
 from thermostand.drivers.wires.camera_line import frame_wire_s, packet_delay_ns
 from thermostand.experiments.steps import Capture
 from thermostand.foundation.clock import WallClock
@@ -13,10 +15,8 @@ from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.stand.assembly import assemble
-from thermostand.stand.commissioning.camera_line_check import shared_lines
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.estimating.camera_lines import camera_lines
 from thermostand.stand.estimating.estimate import price
 
 RECIPE = """
@@ -49,7 +49,7 @@ def test_a_frame_takes_as_long_as_its_packets_and_their_pauses():
 
 
 def test_three_cameras_of_5_MP_at_2_frames_a_second_fit_on_one_line():
-    lines = camera_lines(of(3))
+    lines = camera_lines(of(3).cameras)
     assert [line.shared_by for line in lines] == [3, 3, 3]
     assert sum(line.share for line in lines) == pytest.approx(0.244, abs=0.002)
     assert all(line.frame_s < 0.5 for line in lines)
@@ -65,11 +65,11 @@ def test_what_the_line_does_not_carry_is_refused_before_the_night():
 
 
 def test_the_check_shows_what_each_camera_needs_of_a_shared_line():
-    assert shared_lines(of(1), "camera") == ()
-    (fits,) = shared_lines(of(3), "left")
+    assert list(line_findings(of(1).cameras, "camera")) == []
+    (fits,) = line_findings(of(3).cameras, "left")
     assert (fits.device, fits.verdict, fits.advice) == ("left", "ok", "")
     assert fits.text.startswith("3 on a line of 1000 Mbit/s, 141.5 us between packets")
-    (slow,) = shared_lines(of(2, line_Mbps=100), "left")
+    (slow,) = line_findings(of(2, line_Mbps=100).cameras, "left")
     assert (slow.verdict, bool(slow.advice)) == ("failed", True)
 
 

@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings
+from thermostand.drivers.devices.cameras.cameras_by_protocol import packet_finding
+from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings, imager_finding
 from thermostand.drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
-from thermostand.stand.commissioning.camera_line_check import packet_finding
-from thermostand.stand.commissioning.imager import imager_finding
 
 WARM = np.full((HEIGHT, WIDTH), 31.0)
 

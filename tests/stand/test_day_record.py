@@ -44,8 +44,7 @@ class Calendar(WallClock):
 @pytest.fixture
 async def open_stand(tmp_path: Path) -> AsyncGenerator[tuple[DayRecord, Hub, Calendar]]:
     hub, clock = Hub(), Calendar()
-    units = dict.fromkeys(("regulator", "heat_module", "relays", "thermometers", "inputs", "flap"))
-    devices = SimpleNamespace(**units, axes={}, probes={})
+    devices = SimpleNamespace(every={}, cameras={})
     assembly = cast("Assembly", SimpleNamespace(hub=hub, clock=clock, devices=devices, config=load_config(CONFIG)))
     record = DayRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock, Patience())
     yield record, hub, clock

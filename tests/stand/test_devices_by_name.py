@@ -52,7 +52,7 @@ def test_a_stand_without_cameras_axes_and_spare_thermometers_is_made():
 
     assembly = assemble(changed(change), Hub(), VirtualClock(0))
     polled = [poller.sensor.name for poller in assembly.pollers()]
-    assert polled == ["regulator", "thermometers", "relays", "flap"]
+    assert polled == ["relays", "regulator", "thermometers", "flap"]
     assert assembly.guard(lambda fault: None) is not None
 
 
@@ -77,7 +77,7 @@ def test_a_plan_says_which_device_it_lacks(sections: list[str], recipe: str, sen
         (lambda data: data["relays"]["channels"].pop("camera_power"), "relays.channels lacks camera_power"),
         (
             lambda data: data["cameras"].update(left=data["cameras"]["camera"]),
-            "bus, axes, probes and cameras need addresses",
+            "bus and devices need addresses",
         ),
         (
             lambda data: data["cameras"].update({"Left": data["cameras"]["camera"]}),

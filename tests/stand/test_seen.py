@@ -3,7 +3,7 @@
 from typing import Any, cast
 
 from tests.stand.room_devices import Rooms, rooms
-from thermostand.drivers.devices.absent_devices import NoRelays
+from thermostand.drivers.devices.relays import NoRelays
 from thermostand.foundation.clock import VirtualClock, seconds_ns
 from thermostand.foundation.errors import Unreachable
 from thermostand.foundation.instants import local_text

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from tests.addresses import free_port
 from tests.system.conftest import require_aravis
+from thermostand.drivers.devices.checking import Finding
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import read_document
 from thermostand.foundation.errors import DeviceFault, InUse
@@ -22,7 +23,6 @@ from thermostand.stand.assembly import assemble
 from thermostand.stand.commands.check_cli import app
 from thermostand.stand.commissioning.answering import not_answering
 from thermostand.stand.commissioning.commissioning import commission
-from thermostand.stand.commissioning.finding import Finding
 from thermostand.stand.config.checked import doubt, load_checked
 from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.running.opening.claim import claimed

@@ -182,7 +182,8 @@ def stand_with(axis: Axis, clock: Clock) -> Stand:
     camera = Camera("camera", GigeCameraSettings(address="127.0.0.1"), clock)
     thermometers = Thermometers("thermometers", bus, maps[0], {}, clock)
     chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, CompressorConfig()), 5.0)
-    devices = Devices(regulator, relays, thermometers, {"linear": axis}, flap, {"camera": camera})
+    every = {each.name: each for each in (regulator, relays, thermometers, flap, axis, camera)}
+    devices = Devices(every, {"linear": axis}, {"camera": camera})
     return Stand(devices, chamber, SupplyLimits(1.0, 15.0), Hub(), clock)
 
 

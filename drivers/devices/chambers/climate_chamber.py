@@ -12,12 +12,14 @@ from typing import Protocol, cast
 
 from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
 from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings
+from thermostand.drivers.devices.checking import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
 from thermostand.drivers.devices.in_force import InForce
+from thermostand.drivers.devices.kinds import CONTROL, Around, DeviceKind
 from thermostand.drivers.settings import Identity, same_device
 from thermostand.foundation.calls import Lane, Result
 from thermostand.foundation.clock import Clock, call_pause_s, seconds_ns
-from thermostand.foundation.errors import DeviceFault, GarbledReply, Refused, Unreachable
+from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from thermostand.foundation.readings import Reading
 
 _LOOKS = 3  # at a state that follows its command a scan of the unit later
@@ -230,3 +232,26 @@ class ClimateChamber:
             Reading(f"{self.name}.running", float(state.running), "1", now_ns),
             Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason=", ".join(faults)),
         )
+
+
+def _make(name: str, settings: ChamberUnitSettings, around: Around) -> ClimateChamber:
+    return ClimateChamber(name, settings, around.of_section("limits").chamber_degC, around.clock)
+
+
+def _advise(error: DeviceError, name: str, settings: ChamberUnitSettings) -> str:
+    if isinstance(error, Unreachable):
+        return "is it on, its interface the one in the file, and no other program connected to it?"
+    return "compare climate_chamber in the stand's file with the unit, and its limits with limits.chamber_degC"
+
+
+KIND = DeviceKind(
+    name="regulator",
+    settings=ChamberUnitSettings,
+    make=_make,
+    section="climate_chamber",
+    device="regulator",
+    rank=20,
+    advise=_advise,
+    check=check_controller,
+    verbs=CONTROL,
+)

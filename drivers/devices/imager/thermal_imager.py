@@ -6,6 +6,7 @@ nobody of new files). It measures to 2 K: for how a housing warms, not for how w
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import math
 import os
@@ -18,8 +19,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from thermostand.drivers.devices.checking import Finding, Look
 from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
 from thermostand.drivers.devices.imager.radiometry import temperatures_degC
+from thermostand.drivers.devices.kinds import Around, DeviceKind
 from thermostand.drivers.settings import DeviceName, Identity, Polled
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
@@ -344,3 +347,66 @@ class ThermalImager:
         if math.isinf(self._offset_s):
             return bad_reading(channel, "s", time_ns, "its pictures have no time")
         return Reading(channel, self._offset_s, "s", time_ns)
+
+
+def _make(name: str, settings: ThermalImagerSettings, around: Around) -> ThermalImager:
+    return ThermalImager(name, settings, around.clock, around.publish)
+
+
+def imager_finding(settings: ThermalImagerSettings) -> Finding:
+    """Blocking: it reads a folder, and one picture."""
+    folder = settings.folder
+    try:
+        newest = max(
+            (file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES),
+            key=lambda file: file.stat().st_mtime_ns,
+            default=None,
+        )
+        data = None if newest is None else newest.read_bytes()
+    except OSError as error:
+        to_do = "is its card or the share mounted at imager.folder, and may this user read it?"
+        return Finding("imager", "link", "failed", f"{folder} cannot be read ({error.strerror})", to_do)
+    if newest is None or data is None:
+        text = f"{folder} is there, with no picture in it"
+        return Finding("imager", "reading", "unverified", text, "take one and check again: a run waits for the first")
+    try:
+        image = parse(data)
+    except NotRadiometric as error:
+        text = f"the newest picture, {newest.name}, has no temperatures: {error}"
+        return Finding("imager", "reading", "failed", text, "set the imager to radiometric JPEG")
+    return _of_picture(settings, newest, image)
+
+
+def _of_picture(settings: ThermalImagerSettings, file: Path, image: RadiometricImage) -> Finding:
+    which = f"{image.model}, serial number {image.serial_number}"
+    if settings.serial_number not in (None, image.serial_number):
+        text = f"the newest picture, {file.name}, is of a {which}, expected {settings.serial_number}"
+        return Finding("imager", "identity", "failed", text, "compare imager.serial_number with the imager's label")
+    height, width = image.counts.shape
+    seen: dict[str, object] = {}
+    for name, spot in settings.spots.items():
+        mean_degC = spot_degC(image, spot)
+        if mean_degC is None:
+            x, y = place_of(image, spot)
+            text = f"the 3 x 3 px of the spot {name} at {x}, {y} px are not within its {width} x {height} px"
+            return Finding("imager", "settings", "failed", text, f"correct imager.spots.{name}")
+        seen[name] = round(mean_degC, 1)
+    texts = ", ".join(f"{name} {degC} degC" for name, degC in seen.items())
+    return Finding("imager", "reading", "ok", f"{which}; its newest picture, {file.name}, shows {texts}", data=seen)
+
+
+async def _check(look: Look) -> None:
+    """Not opened: what its folder has, and what the newest picture shows."""
+    look.add(await asyncio.to_thread(imager_finding, look.settings))
+
+
+KIND = DeviceKind(
+    name="imager",
+    settings=ThermalImagerSettings,
+    make=_make,
+    section="imager",
+    device="imager",
+    rank=60,
+    address_key="folder",
+    check=_check,
+)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, Self, cast
 
@@ -13,13 +14,23 @@ import usb.core
 import usb.util
 from pydantic import Field, model_validator
 
+from thermostand.drivers.devices.checking import Look
+from thermostand.drivers.devices.kinds import Around, DeviceKind, Missing, Place, Verb
 from thermostand.drivers.devices.motion.flap_travel import POLL_S, Travel
 from thermostand.drivers.devices.motion.motion import Motion, Turn
 from thermostand.drivers.settings import Identity, Polled, same_device
 from thermostand.foundation.addresses import TcpAddress
 from thermostand.foundation.calls import Lane, Result
 from thermostand.foundation.clock import Clock, seconds_ns
-from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Superseded, Unreachable
+from thermostand.foundation.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceFault,
+    GarbledReply,
+    Refused,
+    Superseded,
+    Unreachable,
+)
 from thermostand.foundation.readings import Quality, Reading, bad_reading
 
 _VENDOR_POLOLU = 0x1FFB
@@ -330,3 +341,100 @@ class Flap:
 def _names(halting: int) -> str:
     names = [name for bit, name in enumerate(_ERROR_NAMES) if halting >> bit & 1]
     return ", ".join(names) or "its target was changed by someone else"
+
+
+class NoFlap:
+    """In place of a flap: cameras see the target all the time, and opening and closing are done at once. What was
+    commanded last is remembered, nothing is read."""
+
+    identity = None
+
+    def __init__(self, name: str, _: Clock) -> None:
+        self.name = name
+        self.is_shut = True
+
+    async def open(self) -> None:
+        """Nothing to connect to."""
+
+    async def close(self) -> None:
+        """Nothing to let go of."""
+
+    async def read(self) -> tuple[Reading, ...]:
+        """Nothing is read."""
+        return ()
+
+    async def move_open(self) -> None:
+        """Nothing moves."""
+        self.is_shut = False
+
+    async def move_closed(self) -> None:
+        """Nothing moves."""
+        self.is_shut = True
+
+    async def make_safe(self) -> None:
+        """As closed."""
+        self.is_shut = True
+
+    def allow(self) -> None:
+        """Nothing was barred."""
+
+
+class _BackendModule(Protocol):
+    def get_backend(self, address: str) -> usb.backend.IBackend: ...
+
+
+def _make(name: str, settings: FlapSettings, around: Around) -> Flap:
+    backend: usb.backend.IBackend | None = None
+    if settings.backend is not None and settings.backend_address is not None:
+        try:
+            module = cast("_BackendModule", importlib.import_module(settings.backend))
+        except ImportError as error:
+            raise ConfigError(f"flap.backend: no module {settings.backend!r} ({error})") from error
+        if not callable(getattr(module, "get_backend", None)):
+            raise ConfigError(f"flap.backend: module {settings.backend!r} has no get_backend(address)")
+        try:
+            backend = module.get_backend(settings.backend_address)
+        except ValueError as error:
+            raise ConfigError(f"flap.backend_address: {error}") from error
+    return Flap(name, settings, around.clock, backend)
+
+
+def _places(settings: FlapSettings) -> Iterator[Place]:
+    if settings.backend_address is None:
+        yield Place("name", f"usb {settings.serial_number}")
+    else:
+        yield Place("wire", settings.backend_address)
+
+
+def _advise(error: DeviceError, name: str, settings: FlapSettings) -> str:
+    if isinstance(error, Unreachable):
+        return "is it plugged in and powered, and flap.serial_number its own? `stand devices` lists all with theirs"
+    return "is something in its way? its counts are of the feedback: compare open_target, closed_target and travel_s"
+
+
+async def _check(look: Look) -> None:
+    """Its controller, and where it stands."""
+    if look.settings is None:
+        look.found("link", "ok", "no flap: cameras see the target all the time")
+    else:
+        await look.answers()
+
+
+KIND = DeviceKind(
+    name="flap",
+    settings=FlapSettings,
+    make=_make,
+    section="flap",
+    device="flap",
+    rank=70,
+    places=_places,
+    address_key="backend_address",
+    stand_in=NoFlap,
+    missing=Missing("flap", "cameras see the target all the time; what opens or closes it takes no time"),
+    advise=_advise,
+    check=_check,
+    verbs=(
+        Verb("open", "open the flap", lambda stand, name, given: stand.move_flap(is_open=True)),
+        Verb("close", "close the flap", lambda stand, name, given: stand.move_flap(is_open=False)),
+    ),
+)

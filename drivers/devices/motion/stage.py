@@ -14,6 +14,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from thermostand.drivers.devices.kinds import Argument, Around, DeviceKind, Missing, Place, Verb
 from thermostand.drivers.devices.motion.motion import Motion, Turn
 from thermostand.drivers.devices.motion.stage_identity import changed_settings, identity_of, power_off_s, speed_steps_s
 from thermostand.drivers.devices.motion.stage_profiles import PROFILES, ProfileName, StageProfile
@@ -373,3 +374,37 @@ def _check(turn: Turn | None) -> None:
 
 def _at_rest(status: _Status) -> bool:
     return not status.running
+
+
+def _make(name: str, settings: AxisSettings, around: Around) -> Axis:
+    return Axis(name, settings, around.clock)
+
+
+def _advise(error: DeviceError, name: str, settings: AxisSettings) -> str:
+    if isinstance(error, Refused):
+        return f"compare axes.{name}.address and serial_number with the controller's label; were two plugs exchanged?"
+    if isinstance(error, Unreachable):
+        return "is it plugged in and powered, and this user in the group dialout? `stand devices` lists the ports"
+    return "look at the stage, remove the cause, and switch its controller off and on"
+
+
+KIND = DeviceKind(
+    name="axis",
+    settings=AxisSettings,
+    make=_make,
+    section="axes",
+    rank=80,
+    places=lambda axis: (Place("wire", axis.address), Place("number", f"stage {axis.serial_number}")),
+    missing=Missing("stages", "a recipe that moves one is refused"),
+    advise=_advise,
+    verbs=(
+        Verb(
+            "move",
+            "move to a position",
+            lambda stand, name, given: stand.move_axis(name, given["position"]),
+            lambda axis, _: (Argument("position", axis.unit, *axis.limits),),
+        ),
+        Verb("stop", "stop where it is", lambda stand, name, given: stand.stop_axis(name)),
+        Verb("home", "find the home switch", lambda stand, name, given: stand.home_axis(name)),
+    ),
+)

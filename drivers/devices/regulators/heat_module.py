@@ -12,7 +12,9 @@ from typing import NoReturn, Self
 
 from pydantic import Field, model_validator
 
+from thermostand.drivers.devices.checking import Look
 from thermostand.drivers.devices.exclusive import Exclusive
+from thermostand.drivers.devices.kinds import Around, DeviceKind
 from thermostand.drivers.devices.relays import COIL_OFF, COIL_ON
 from thermostand.drivers.settings import Identity, OnBus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
@@ -333,3 +335,29 @@ class HeatModule:
             return await self._is(coil) == on
 
         await self._unit.checked(send, holds, f"{coil} {'on' if on else 'off'}")
+
+
+def _make(name: str, settings: HeatModuleSettings, around: Around) -> HeatModule:
+    unit = ModbusUnit(name, around.bus, around.map_of("heat_module", settings))
+    return HeatModule(unit, settings, around.clock)
+
+
+async def _check(look: Look) -> None:
+    """Opened as a run does it."""
+    await look.answers()
+    places = ("output", "present", "safe", "power_on", "type_code")
+    watchdog = ("watchdog_mode", _WATCHDOG, _TIME, _TRIPPED, "data_format")
+    await look.points((*(f"{each}_{look.settings.channel}" for each in places), *watchdog))
+
+
+KIND = DeviceKind(
+    name="output",
+    settings=HeatModuleSettings,
+    make=_make,
+    section="heat_module",
+    device="heat_module",
+    rank=15,
+    is_opened=False,  # by the regulator that heats by it
+    address_key="",
+    check=_check,
+)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from thermostand.drivers.devices.checking import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
 from thermostand.drivers.devices.in_force import InForce
-from thermostand.drivers.settings import Identity
+from thermostand.drivers.devices.kinds import CONTROL, Around, DeviceKind
+from thermostand.drivers.settings import Identity, OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import CONFIRM_LOOKS, ModbusUnit, Sample, Snapshot, is_confirmed, objection
 from thermostand.drivers.wires.registers import RegisterMap
@@ -218,3 +220,20 @@ class Regulator:
         if sample.reason:
             return bad_reading(channel, unit, now_ns, sample.reason)
         return Reading(channel, sample.value, unit, now_ns)
+
+
+def _make(name: str, settings: OnBus, around: Around) -> Regulator:
+    return Regulator(name, around.bus, around.map_of("regulator", settings), around.clock)
+
+
+KIND = DeviceKind(
+    name="regulator",
+    settings=OnBus,
+    make=_make,
+    section="regulator",
+    device="regulator",
+    rank=20,
+    address_key="",
+    check=check_controller,
+    verbs=CONTROL,
+)

@@ -11,16 +11,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import Literal
+from typing import Literal, cast
 
 from pydantic import Field
 
+from thermostand.drivers.devices.checking import Look
 from thermostand.drivers.devices.in_force import InForce
-from thermostand.drivers.devices.protocols import HeatOutput
+from thermostand.drivers.devices.kinds import CONTROL, Arguments, Around, DeviceKind, Hands, Verb
+from thermostand.drivers.devices.protocols import HeatOutput, Switches
 from thermostand.drivers.devices.regulators import pid, relay_tuning
-from thermostand.drivers.devices.regulators.heat_pulses import PulsesSettings
+from thermostand.drivers.devices.regulators.heat_module import HeatModule
+from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings
 from thermostand.drivers.devices.regulators.pid import Law
 from thermostand.drivers.devices.regulators.relay_tuning import Found, Tuning, TuningSettings
+from thermostand.drivers.devices.relays import HEAT
 from thermostand.drivers.settings import DeviceName, Identity, Polled
 from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import DeviceError, DeviceFault, Occupied, Refused
@@ -273,3 +277,44 @@ class SoftwareRegulator:
         if reading is None:
             return bad_reading(channel, "degC", now_ns, f"thermometers.{self._settings.thermometer} was not read yet")
         return replace(reading, channel=channel)
+
+
+def _make(name: str, settings: SoftwareRegulatorSettings, around: Around) -> SoftwareRegulator:
+    module, relays = around.made.get("heat_module"), cast("Switches", around.made["relays"])
+    return SoftwareRegulator(
+        name,
+        settings,
+        module if isinstance(module, HeatModule) else HeatPulses(relays, settings.pulses, around.clock),
+        lambda: around.known(f"thermometers.{settings.thermometer}"),
+        around.of_section("limits").chamber_degC,
+        around.of_section("guard").stale_after_s,
+        around.clock,
+        around.publish,
+    )
+
+
+async def _autotune(stand: Hands, name: str, given: Arguments) -> None:
+    await stand.heat(given["setpoint_degC"])
+    await stand.device(name).autotune()
+
+
+async def _check(look: Look) -> None:
+    """Nothing is opened: what it measures and heats by is looked at by itself."""
+    look.opened.add(look.name)
+    by = "heat_module" if "heat_module" in look.made else f"relays.{HEAT}"
+    text = f"this program itself: it measures thermometers.{look.settings.thermometer} and heats by {by}"
+    look.found("link", "ok", text, data=look.settings.model_dump(mode="json"))
+
+
+_AUTOTUNE = "find the constants of its law about a set-point, once that is held"
+KIND = DeviceKind(
+    name="regulator",
+    settings=SoftwareRegulatorSettings,
+    make=_make,
+    section="regulator",
+    device="regulator",
+    rank=35,  # after the thermometers, of which it shows what was read
+    address_key="",
+    check=_check,
+    verbs=(*CONTROL, Verb("autotune", _AUTOTUNE, _autotune, CONTROL[0].arguments)),
+)

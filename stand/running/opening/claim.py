@@ -39,29 +39,20 @@ class Address(NamedTuple):
 
 
 def addresses(config: StandConfig) -> tuple[Address, ...]:
-    """Where a run of this stand reads and switches: the bus, each axis, the flap and each camera.
+    """Where a run of this stand reads and switches: the bus, and each device by its kind.
 
     Real flaps, cameras and stages count by their serial numbers, too: behind another address they are the same ones. Of
     a simulated laboratory there may be several, with the same numbers. Asks the name service, and so may take a while.
     """
-    flap, is_real = config.flap, config.simulation is None
     found = [Address("bus", place) for place in _places(config.bus.address)]
-    if config.climate_chamber is not None:
-        found += [Address("regulator", place) for place in _places(config.climate_chamber.address)]
-    for name, axis in config.axes.items():
-        found += [Address(name, place) for place in _places(axis.address)]
-        if is_real:
-            found.append(Address(name, f"stage {axis.serial_number}"))
-    for name, probe in config.probes.items():
-        found += [Address(name, place) for place in _places(probe.address)]
-    if flap is not None and flap.backend_address is not None:
-        found += [Address("flap", place) for place in _places(flap.backend_address)]
-    elif flap is not None:
-        found.append(Address("flap", f"usb {flap.serial_number}"))
-    for name, camera in config.cameras.items():
-        found.append(Address(name, _of_host("camera", camera.address)))
-        if is_real and camera.serial_number is not None:
-            found.append(Address(name, f"camera {camera.serial_number}"))
+    for name, kind, settings in config.equipment:
+        for how, text in kind.places(settings) if settings is not None else ():
+            if how == "wire":
+                found += [Address(name, place) for place in _places(text)]
+            elif how == "host":
+                found.append(Address(name, _of_host(kind.name, text)))
+            elif how == "name" or config.simulation is None:
+                found.append(Address(name, text))
     return tuple(found)
 
 

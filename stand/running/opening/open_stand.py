@@ -9,8 +9,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, cast
 
+from thermostand.drivers.devices.protocols import Actuator
 from thermostand.foundation.clock import VirtualClock, WallClock
 from thermostand.foundation.errors import DeviceFault, StandError, Unreachable
 from thermostand.foundation.events import LATCH_NOT_CLEARED, LATCH_NOT_KEPT
@@ -313,25 +314,21 @@ async def _open(assembly: Assembly, *, is_for_one: bool) -> None:
             raise
         remedy = "`stand simulate` starts the simulated laboratory, in another terminal"
         raise Unreachable(error.device, f"{error.text}; {remedy}") from error
-    await devices.relays.open()
-    stand.opened(devices.relays)
-    await stand.chamber.permits.withdraw_left_on()
-    await devices.regulator.open()
-    stand.opened(devices.regulator)
-    await devices.regulator.stop()
-    if is_for_one and (objections := (await devices.regulator.in_force()).objections):
-        raise DeviceFault(devices.regulator.name, f"its set-point is not in force: {'; '.join(objections)}")
-    await devices.thermometers.open()
-    for probe in devices.probes.values():
-        await probe.open()
-    await devices.flap.open()
-    stand.opened(devices.flap)
-    await devices.flap.move_closed()
-    for axis in devices.axes.values():
-        await axis.open()
-        stand.opened(axis)
-    if devices.imager is not None:
-        await devices.imager.open()
+    for each in assembly.equipment:
+        if not each.kind.is_opened:
+            continue
+        device = devices.every[each.name]
+        await device.open()
+        if hasattr(device, "make_safe"):
+            stand.opened(cast("Actuator", device))
+        if device is devices.relays:
+            await stand.chamber.permits.withdraw_left_on()
+        elif device is devices.flap:
+            await devices.flap.move_closed()
+        elif device is devices.regulator:
+            await devices.regulator.stop()
+            if is_for_one and (objections := (await devices.regulator.in_force()).objections):
+                raise DeviceFault(device.name, f"its set-point is not in force: {'; '.join(objections)}")
     await stand.chamber.test_dead_man()
 
 
@@ -363,10 +360,7 @@ async def at_bench(config: StandConfig, command: str) -> AsyncGenerator[Assembly
 
 async def close_devices(assembly: Assembly) -> None:
     """Let go of every wire; actuators stay as they are."""
-    devices = assembly.devices
-    imagers = (devices.imager,) if devices.imager is not None else ()
-    others = (*devices.axes.values(), *devices.probes.values(), *imagers, devices.flap, devices.regulator)
-    await asyncio.gather(*(_let_go(device.close()) for device in (*devices.cameras.values(), *others)))
+    await asyncio.gather(*(_let_go(device.close()) for device in assembly.devices.every.values()))
     await assembly.bus.close()
 
 

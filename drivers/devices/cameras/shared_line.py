@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from thermostand.drivers.devices.cameras.camera_gige import Settings as GigeSettings
+from thermostand.drivers.settings import CameraSettings
 from thermostand.drivers.wires.camera_line import frame_wire_s, packet_delay_ns
-from thermostand.drivers.wires.camera_settings import frame_bytes
-from thermostand.stand.config.stand_config import StandConfig
+from thermostand.drivers.wires.camera_settings import GigeCameraSettings, frame_bytes
 
 _SENSOR_PX = (2448, 2048)  # of a camera whose size nobody states, as in the plan's estimate of the disk
 _PACKET_SIZE = 1500  # of a camera that finds its own: what every network carries
+
+
+def on_line(settings: CameraSettings, cameras: Iterable[CameraSettings]) -> CameraSettings:
+    """The settings; those of a GigE camera with the number of cameras on its line, which are all GigE cameras of the
+    stand unless the stand's file states it."""
+    if not isinstance(settings, GigeCameraSettings) or settings.line_shared_by is not None:
+        return settings
+    all_of_them = sum(isinstance(each, GigeCameraSettings) for each in cameras)
+    return settings if all_of_them == 1 else settings.model_copy(update={"line_shared_by": all_of_them})
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,24 +43,12 @@ class CameraLine:
         )
 
 
-def sharing(config: StandConfig, name: str) -> GigeSettings | None:
-    """A GigE camera's settings, with the number of cameras on its line when they are several; None for a camera of
-    another kind."""
-    settings = config.cameras[name]
-    if not isinstance(settings, GigeSettings):
-        return None
-    all_of_them = sum(isinstance(each, GigeSettings) for each in config.cameras.values())
-    if all_of_them == 1 or settings.line_shared_by is not None:
-        return settings
-    return settings.model_copy(update={"line_shared_by": all_of_them})
-
-
-def camera_lines(config: StandConfig) -> tuple[CameraLine, ...]:
+def camera_lines(cameras: Mapping[str, CameraSettings]) -> tuple[CameraLine, ...]:
     """Of each GigE camera, in the order of the stand's file."""
     lines: list[CameraLine] = []
-    for name in config.cameras:
-        settings = sharing(config, name)
-        if settings is None:
+    for name, camera in cameras.items():
+        settings = on_line(camera, cameras.values())
+        if not isinstance(settings, GigeCameraSettings):
             continue
         shared_by, packet_size = settings.line_shared_by or 1, settings.packet_size or _PACKET_SIZE
         delay_ns = settings.packet_delay_ns
@@ -69,9 +66,9 @@ def camera_lines(config: StandConfig) -> tuple[CameraLine, ...]:
     return tuple(lines)
 
 
-def overloaded(config: StandConfig, interval_s: float) -> str:
+def overloaded(cameras: Mapping[str, CameraSettings], interval_s: float) -> str:
     """Why the line does not carry a frame of each camera every `interval_s`, "" when it does."""
-    for line in camera_lines(config):
+    for line in camera_lines(cameras):
         if line.frame_s > interval_s:
             return (
                 f"a frame every {interval_s} s is faster than the line of {line.line_Mbps:g} Mbit/s that "

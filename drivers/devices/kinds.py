@@ -1,0 +1,253 @@
+"""What a kind of device states of itself, once. The stand derives from it how one is made, locked, opened, polled,
+checked, moved by hand, recorded and simulated.
+
+Each driver module has its row, `KIND`, which `built_in` finds. Another package adds one by an entry
+point of the group `thermostand.devices`, named as the kind, which is the row itself; a stand's file has such devices by
+their names below `devices:`, each with its `kind` and what that kind's settings ask for.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Coroutine, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any, Literal, NamedTuple, Protocol, cast
+
+from pydantic import ValidationError
+from pydantic_core import PydanticCustomError
+
+import thermostand.drivers.devices
+from thermostand.drivers.devices.checking import Look, check_answers
+from thermostand.drivers.devices.protocols import Sensor
+from thermostand.drivers.settings import OnBus
+from thermostand.drivers.wires.bus import Bus
+from thermostand.drivers.wires.registers import RegisterMap
+from thermostand.foundation.clock import Clock
+from thermostand.foundation.document_faults import path_text, words
+from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
+from thermostand.foundation.items import Item
+from thermostand.foundation.readings import Reading
+
+GROUP = "thermostand.devices"
+ADDED = "devices"  # the section of a stand's file for the kinds of other packages
+Work = Coroutine[None, None, object]
+Arguments = Mapping[str, float]
+OfSection = Callable[[str], Any]  # what a section of the stand's file has
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """What a driver may use of the stand that its device is made for. made: the devices before it, by name. known: the
+    last reading of a channel. of_section: what another section of the stand's file has. map_of: the register map of a
+    unit, named in that section; ConfigError when it is missing or wrong."""
+
+    clock: Clock
+    bus: Bus
+    made: Mapping[str, Sensor]
+    publish: Callable[[Item], None]
+    known: Callable[[str], Reading | None]
+    of_section: OfSection
+    map_of: Callable[[str, OnBus], RegisterMap]
+
+
+class Place(NamedTuple):
+    """Where a device is found, which no two runs may use at once. wire: a serial or TCP address; host: of what answers
+    at one; number: what a real device is known by wherever it is; name: as it is."""
+
+    how: Literal["wire", "host", "number", "name"]
+    text: str
+
+
+class Argument(NamedTuple):
+    """A number that a verb takes, with its unit and bounds; the default is for one that is not given."""
+
+    name: str
+    unit: str = "1"
+    minimum: float | None = None
+    maximum: float | None = None
+    default: float | None = None
+
+
+class Hands(Protocol):
+    """What the stand does for the verbs of its devices, through gate, interlock and limits, as for a step of a run. All
+    raise what those raise."""
+
+    def device(self, name: str) -> Any:
+        """The device of that name, when something may be done with it now."""
+        ...
+
+    def heat(self, degC: float) -> Work:
+        """Heat or cool to a set-point."""
+        ...
+
+    def stop_heat(self) -> Work:
+        """Stop heating and cooling."""
+        ...
+
+    def move_flap(self, *, is_open: bool) -> Work:
+        """Open or shut the flap."""
+        ...
+
+    def move_axis(self, name: str, position: float) -> Work:
+        """Move a stage."""
+        ...
+
+    def stop_axis(self, name: str) -> Work:
+        """Stop a stage where it is."""
+        ...
+
+    def home_axis(self, name: str) -> Work:
+        """Find a stage's home switch."""
+        ...
+
+    def supply_cameras(self, *, is_on: bool) -> Work:
+        """Switch the supply of all cameras."""
+        ...
+
+    def take_frame(self, exposure_s: float) -> Work:
+        """One frame of each camera."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """What a person may tell a device between runs."""
+
+    name: str
+    text: str
+    act: Callable[[Hands, str, Arguments], Work]
+    arguments: Callable[[Any, OfSection], tuple[Argument, ...]] = lambda settings, of_section: ()
+
+
+def _set_points(settings: object, of_section: OfSection) -> tuple[Argument, ...]:
+    return (Argument("setpoint_degC", "degC", *of_section("limits").chamber_degC),)
+
+
+CONTROL = (
+    Verb("set", "heat or cool to a set-point", lambda stand, _, given: stand.heat(given["setpoint_degC"]), _set_points),
+    Verb("stop", "stop heating and cooling", lambda stand, name, given: stand.stop_heat()),
+)
+"""What a person may tell whatever holds the chamber's temperature."""
+
+
+class Missing(NamedTuple):
+    """What a stand has not, and what follows from that, as parts of a sentence."""
+
+    what: str
+    means: str
+
+
+def _places(settings: Any) -> Iterable[Place]:
+    """Its address, if it has one of its own."""
+    address = getattr(settings, "address", None)
+    return () if address is None else (Place("wire", address),)
+
+
+def _advise(error: DeviceError, name: str, settings: Any) -> str:
+    if isinstance(error, Unreachable):
+        return "is it plugged in and on, and its address right? `stand devices` lists the ports"
+    return f"compare {name} in the stand's file with the device"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceKind:
+    """One row. name: as the device is shown. settings: its keys in the stand's file. make: the device, not opened.
+
+    section: where the stand's file has it; device: its name, where there is only one. rank: the order in which devices
+    are made, opened, polled and checked. is_opened: with the stand, else by what uses it. places: what is locked.
+    address_key: the setting that says where it answers, "" for a unit on the bus. stand_in: what is in its place on a
+    stand without one, which is polled each stand_in_s, None for not at all. missing: what such a stand lacks. advise:
+    what a person does about an error. check: what `stand check` looks at. verbs: what a person may tell it.
+    """
+
+    name: str
+    settings: type[Document]
+    make: Callable[[str, Any, Around], Sensor]
+    section: str = ADDED
+    device: str = ""
+    rank: int = 85
+    is_opened: bool = True
+    places: Callable[[Any], Iterable[Place]] = _places
+    address_key: str = "address"
+    stand_in: Callable[[str, Clock], Sensor] | None = None
+    stand_in_s: float | None = None
+    missing: Missing | None = None
+    advise: Callable[[DeviceError, str, Any], str] = _advise
+    check: Callable[[Look], Coroutine[None, None, None]] = check_answers
+    verbs: tuple[Verb, ...] = ()
+
+
+class Equipment(NamedTuple):
+    """One device of a stand; settings: None for what is in the place of one that it lacks."""
+
+    name: str
+    kind: DeviceKind
+    settings: Any
+
+    @property
+    def poll_s(self) -> float | None:
+        """How often it is read; None for never."""
+        return self.kind.stand_in_s if self.settings is None else self.settings.poll_s
+
+    def made(self, around: Around) -> Sensor:
+        """The device, or what is in its place; not opened."""
+        if self.settings is None and self.kind.stand_in is not None:
+            return self.kind.stand_in(self.name, around.clock)
+        return self.kind.make(self.name, self.settings, around)
+
+
+@cache
+def built_in() -> tuple[DeviceKind, ...]:
+    """The rows of the modules in drivers/devices, in the order of their ranks."""
+    found: list[DeviceKind] = []
+    root = thermostand.drivers.devices
+    for module in pkgutil.walk_packages(root.__path__, f"{root.__name__}."):
+        known = vars(importlib.import_module(module.name))
+        found += cast("tuple[DeviceKind, ...]", known.get("KINDS", (known["KIND"],) if "KIND" in known else ()))
+    return tuple(sorted(found, key=lambda kind: kind.rank))
+
+
+def added_kind(name: str) -> DeviceKind:
+    """The kind that another package adds under that name; ConfigError when there is none, or it cannot be loaded."""
+    for point in entry_points(group=GROUP, name=name):
+        package = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
+        try:
+            kind = point.load()
+        except Exception as error:  # importing a stranger's module may raise anything
+            raise ConfigError(f"{name}: {package} cannot be loaded ({error}); reinstall it") from error
+        if not isinstance(kind, DeviceKind) or (kind.name, kind.section) != (name, ADDED):
+            raise ConfigError(f"{name}: {package} has no DeviceKind of that name there; correct the package")
+        return kind
+    known = ", ".join(sorted({point.name for point in entry_points(group=GROUP)})) or "none installed"
+    raise ConfigError(f"no package adds a device of kind {name!r}; there are {known}")
+
+
+def added_settings(data: object) -> object:
+    """The settings of a device of another package, by its `kind`; ValueError for what they do not take."""
+    if not isinstance(data, dict):
+        return data
+    keys = cast("dict[str, object]", data)
+    try:
+        return added_kind(str(keys.get("kind", ""))).settings.model_validate(keys)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    except ValidationError as error:
+        faults = (f"{path_text(each['loc'])}: {words(each)}" for each in error.errors())
+        raise PydanticCustomError("device", "{text}", {"text": "; ".join(faults)}) from error
+
+
+def equipment_of(config: object, added: Mapping[str, Any]) -> tuple[Equipment, ...]:
+    """Every device that a stand's file has, in the order of their ranks, with stand-ins for those that it lacks. added:
+    those of other packages, by name."""
+    found = [Equipment(name, added_kind(settings.kind), settings) for name, settings in added.items()]
+    for kind in built_in():
+        section = getattr(config, kind.section)
+        named = cast("Mapping[str, Any]", {kind.device: section} if kind.device else section)
+        found += [Equipment(name, kind, each) for name, each in named.items() if isinstance(each, kind.settings)]
+        if section is None and kind.stand_in is not None:
+            found.append(Equipment(kind.device, kind, None))
+    return tuple(sorted(found, key=lambda each: each.kind.rank))

@@ -1,0 +1,226 @@
+"""A kind of device that another package adds is found everywhere by its one row, and its fake by its name."""
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import yaml
+
+from thermostand.drivers.devices.checking import Finding
+from thermostand.foundation.clock import VirtualClock
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.hub import Hub
+from thermostand.recording.reading.session import Session
+from thermostand.stand import simulator
+from thermostand.stand.assembly import assemble, device_kinds
+from thermostand.stand.commissioning.answering import not_answering
+from thermostand.stand.commissioning.commissioning import commission
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.daemon.hands_on import by_hand, known_devices
+from thermostand.stand.running.opening.claim import addresses
+from thermostand.stand.running.order import Order
+from thermostand.stand.running.run import run_virtual
+from thermostand.stand.simulator import Simulator, laboratory_of, relocated
+
+MODULE = '''
+"""A lamp that a line of text switches, and that tells its current: `?` -> `I=0.25`, `on` and `off` -> `ok`."""
+
+import asyncio
+from typing import Literal
+
+from thermostand.drivers.devices.kinds import Argument, DeviceKind, Verb
+from thermostand.drivers.settings import Identity, Polled
+from thermostand.drivers.wires.line_client import LineClient
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.addresses import ByteAddress
+from thermostand.foundation.readings import Reading
+
+
+class Settings(Polled):
+    kind: Literal["lamp"]
+    address: ByteAddress
+    most_percent: float = 90.0
+
+
+class Lamp:
+    def __init__(self, name, settings, clock):
+        self.name, self.identity, self._clock = name, None, clock
+        self._client = LineClient.at(name, settings.address, SerialSettings(9600, 1), (1.0, 0.0))
+
+    async def _ask(self, text):
+        def whole(data):
+            return data.decode() if data.endswith(b"\\n") else None
+
+        return (await asyncio.to_thread(self._client.query, text.encode() + b"\\n", whole)).strip()
+
+    async def open(self):
+        await self._ask("?")
+        self.identity = Identity("Acme", "L1", "7", "")
+
+    async def close(self):
+        await asyncio.to_thread(self._client.close)
+
+    async def read(self):
+        current_A = float((await self._ask("?")).removeprefix("I="))
+        return (Reading(f"{self.name}.current", current_A, "A", self._clock.now_ns()),)
+
+    async def shine(self, percent):
+        await self._ask(f"{percent:g}")
+
+    async def make_safe(self):
+        await self.shine(0.0)
+
+
+KIND = DeviceKind(
+    name="lamp",
+    settings=Settings,
+    make=lambda name, settings, around: Lamp(name, settings, around.clock),
+    verbs=(
+        Verb(
+            "shine",
+            "give light",
+            lambda stand, name, given: stand.device(name).shine(given["percent"]),
+            lambda settings, of_section: (Argument("percent", "%", 0.0, settings.most_percent),),
+        ),
+    ),
+)
+'''
+FAKE = """
+from thermostand.drivers.sim.wire import Lines
+
+
+class FakeLamp:
+    def __init__(self, plant, clock, settings, seed):
+        self.percent = 0.0
+
+    def engine(self):
+        return Lines(self.answer)
+
+    def answer(self, line):
+        if line.strip() != b"?":
+            self.percent = float(line)
+        return b"I=%.2f" % (self.percent / 100)
+"""
+
+
+@pytest.fixture
+def lamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The package, installed, for this process and those that it starts; nothing of this program knows it."""
+    folder = tmp_path / "site"
+    info = folder / "acme_lamp-1.0.dist-info"
+    info.mkdir(parents=True)
+    (folder / "acme_lamp.py").write_text(MODULE)
+    (folder / "acme_fake.py").write_text(FAKE)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-lamp\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[thermostand.devices]\nlamp = acme_lamp:KIND\ndim = acme_lamp:KIND\nnone = acme_none:KIND\n"
+        "[thermostand.fakes]\nlamp = acme_fake:FakeLamp\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setattr(simulator, "subprocess", subprocess)  # a program of its own, which sees what is installed
+    yield
+    sys.modules.pop("acme_lamp", None)
+
+
+RECIPE = """
+name: short
+experiments:
+  - steps: [{start_chamber: 24}, {soak: 60}]
+"""
+
+
+def stand_with(**device: object) -> StandConfig:
+    data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
+    data["devices"] = {"beam": {"kind": "lamp", "address": "tcp:127.0.0.1:15099", **device}}
+    return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
+
+
+@pytest.fixture
+def laboratory(lamp: None) -> Iterator[StandConfig]:
+    """The stand with a lamp, at the addresses of a simulated laboratory that runs in real time."""
+    config = stand_with()
+    config = config.model_copy(update={"cameras": {}, "axes": {}, "flap": None})
+    started = Simulator(laboratory_of(config, virtual=False, seed=None, is_anywhere=True))
+    yield relocated(config, started.addresses)
+    started.stop()
+
+
+@pytest.mark.usefixtures("lamp")
+def test_a_stand_s_file_names_it_and_its_settings_are_checked():
+    assert [(each.name, each.kind.name, each.poll_s) for each in stand_with().equipment if each.name == "beam"] == [
+        ("beam", "lamp", 1.0)
+    ]
+    for device, sentence in (
+        ({"poll_s": -1}, "devices.beam: poll_s: must be greater than 0"),
+        ({"colour": "red"}, "devices.beam: colour: unknown key"),
+        ({"kind": "torch"}, "devices.beam: no package adds a device of kind 'torch'; there are dim, lamp, none"),
+        ({"kind": "none"}, "devices.beam: none: acme-lamp 1.0 cannot be loaded .*; reinstall it"),
+        ({"kind": "dim"}, "devices.beam: dim: acme-lamp 1.0 has no DeviceKind of that name there"),
+        ({"address": "tcp:127.0.0.1:15020"}, "bus and devices need addresses of their own"),
+    ):
+        with pytest.raises(ConfigError, match=sentence):
+            stand_with(**device)
+
+
+@pytest.mark.usefixtures("lamp")
+def test_it_is_locked_made_polled_shown_and_rehearsed():
+    config = stand_with()
+    assert ("beam", "tcp 127.0.0.1:15099") in {
+        (each.device, each.place.partition(" in ")[0]) for each in addresses(config)
+    }
+    assembly = assemble(config, Hub(), VirtualClock(0))
+    assert "beam" in [poller.sensor.name for poller in assembly.pollers()]
+    assert device_kinds(config)["beam"] == "lamp"
+    (known,) = [each for each in known_devices(config) if each.name == "beam"]
+    assert [verb.verb for verb in known.verbs] == ["read", "shine"]
+    assert [(each.name, each.unit, each.maximum) for each in known.verbs[1].arguments] == [("percent", "%", 90.0)]
+
+
+def test_the_check_looks_at_it_and_says_what_to_do(laboratory: StandConfig):
+    found: list[Finding] = []
+    asyncio.run(commission(laboratory, found.extend, has_moves=False))
+    assert [(each.what, each.verdict, each.text) for each in found if each.device == "beam"] == [
+        ("identity", "ok", "Acme L1, serial number 7"),
+        ("reading", "ok", "current 0 A"),
+    ]
+    assert asyncio.run(not_answering(laboratory)) == ()
+    device = laboratory.devices["beam"].model_copy(update={"address": "tcp:127.0.0.1:9"})
+    found.clear()
+    silent = laboratory.model_copy(update={"devices": {"beam": device}})
+    asyncio.run(commission(silent, found.extend, has_moves=False))
+    (lost,) = [each for each in found if each.device == "beam"]
+    assert (lost.what, lost.verdict) == ("link", "failed")
+    assert "its address right" in lost.advice
+    assert [text for text in asyncio.run(not_answering(silent)) if text.startswith("beam")]
+
+
+def test_it_obeys_by_hand_and_is_safe_afterwards(laboratory: StandConfig):
+    def told(verb: str, **arguments: int) -> float:
+        done = asyncio.run(by_hand(laboratory, "beam", verb, arguments, None, print))
+        ((reading,),) = (cast("list[dict[str, float]]", done.data),)
+        return reading["value"]
+
+    assert told("shine", percent=40) == pytest.approx(0.4)
+    assert told("read") == 0.0
+    with pytest.raises(ConfigError, match="beam does not know dim; it takes read, shine"):
+        told("dim")
+
+
+@pytest.mark.usefixtures("lamp")
+async def test_a_run_records_what_it_reads(tmp_path: Path, order: Callable[..., Order]):
+    ordered = order(RECIPE, devices={"beam": {"kind": "lamp", "address": "tcp:127.0.0.1:15099"}})
+    session = Session.open(await run_virtual(ordered, tmp_path / "out", None, lambda hub: None))
+    times_ns, values, *_ = session.readings("beam.current")
+    assert len(times_ns) > 10
+    assert set(values) == {0.0}
+    (identity,) = [
+        each for each in session.events() if each.kind == "device_identity" and each.data["device"] == "beam"
+    ]
+    assert identity.data["vendor"] == "Acme"
