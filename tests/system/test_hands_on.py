@@ -31,7 +31,7 @@ def tell(tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., S
 
 def test_devices_are_operated_by_hand_and_left_safe(tell: Callable[..., Result], tmp_path: Path):
     devices = {each["name"]: [verb["verb"] for verb in each["verbs"]] for each in json.loads(tell().stdout)}
-    assert list(devices)[:2] == ["regulator", "relays"]
+    assert list(devices)[:2] == ["relays", "regulator"]
     assert (devices["thermometers"], devices["flap"]) == (["read", "registers"], ["read", "open", "close"])
     assert "grab" in devices["camera"]
     readings = {each["channel"]: each["value"] for each in json.loads(tell("thermometers", "read").stdout)}
@@ -53,7 +53,7 @@ def test_what_is_not_done_by_hand_is_said(tell: Callable[..., Result]):
         (("linear", "move", "position=500"), "outside the limits"),
         (("linear", "registers"), "linear has no registers"),
         (("linear", "mvoe", "position=1"), "linear does not know mvoe; it takes read, move, stop, home"),
-        (("lid", "open"), "this stand has no device lid; there are regulator"),
+        (("lid", "open"), "this stand has no device lid; there are relays, regulator"),
     ):
         done = tell(*words)
         assert done.exit_code
