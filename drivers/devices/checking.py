@@ -61,7 +61,7 @@ class Look:
     section: str
     advise: Callable[[DeviceError], str]
     clock: Clock
-    bus: Bus
+    modbus: Bus
     is_bus_up: bool
     made: Mapping[str, Sensor]
     opened: set[str]
@@ -109,7 +109,9 @@ class Look:
         """Of a unit on the bus that answers: the points of its register map that were never seen on a unit; those of
         `used` only, when given."""
         if self.name in self.opened:
-            for finding in await unverified_points(self.name, self.bus, self.map_of(self.section, self.settings), used):
+            for finding in await unverified_points(
+                self.name, self.modbus, self.map_of(self.section, self.settings), used
+            ):
                 self.add(finding)
 
     def _advice(self, error: DeviceError) -> str:

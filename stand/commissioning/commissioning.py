@@ -68,7 +68,7 @@ async def _looks(assembly: Assembly, add: Add, *, has_moves: bool) -> AsyncItera
                 section=kind.section,
                 advise=partial(_advised, each),
                 clock=assembly.clock,
-                bus=assembly.bus,
+                modbus=assembly.bus,
                 is_bus_up=is_bus_up,
                 made=assembly.devices.every,
                 opened=opened,
