@@ -25,7 +25,7 @@ from thermostand.compensation.commands.options import (
 )
 from thermostand.compensation.observations import session_target
 from thermostand.compensation.one_camera import serial_of
-from thermostand.compensation.reporting.calibration_report import report_page
+from thermostand.compensation.reporting.pages import calibration_page
 from thermostand.foundation.command_app import App
 from thermostand.foundation.files import check_folder_writable, check_writable, write_whole
 from thermostand.foundation.output import show
@@ -80,7 +80,7 @@ def calibrate_session(
     found = calibrate(positions, used, sigma, model)
     file = _file(opened, used.name, found, keep_rays=keep_rays)
     lines = [summary(file, used)]
-    page = None if report is None else report_page(file, found)
+    page = None if report is None else calibration_page(file, found)
     if report is not None and page is not None:
         write_whole(report, page)
     if export is not None:

@@ -12,9 +12,9 @@ from thermostand.compensation.datasheet.datasheet import datasheet
 from thermostand.compensation.datasheet.details import load_details
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.model_file import load_model
-from thermostand.compensation.reporting.datasheet_page import datasheet_json, datasheet_page
 from thermostand.compensation.reporting.equipment import equipment_of
-from thermostand.compensation.reporting.pdf import pdf_of
+from thermostand.compensation.reporting.page import pdf_of
+from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.files import check_writable, write_whole, write_whole_bytes

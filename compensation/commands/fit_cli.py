@@ -25,7 +25,7 @@ from thermostand.compensation.drift.unrepeated import Cause, find_unrepeated
 from thermostand.compensation.observations import Observations
 from thermostand.compensation.reporting.drawing.drawing import drawing
 from thermostand.compensation.reporting.equipment import equipment_of
-from thermostand.compensation.reporting.extras import Extras
+from thermostand.compensation.reporting.numbers import Extras, table_positions
 from thermostand.compensation.reporting.report import (
     NoModel,
     can_be_scored,
@@ -34,7 +34,6 @@ from thermostand.compensation.reporting.report import (
     numbers_path,
     write_report,
 )
-from thermostand.compensation.reporting.table_positions import table_positions
 from thermostand.compensation.validation3d.document import load_validation
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError

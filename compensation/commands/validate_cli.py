@@ -14,7 +14,7 @@ from thermostand.compensation.commands.options import Finding
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.observations import Float
 from thermostand.compensation.one_camera import name_of
-from thermostand.compensation.reporting.validation_report import validation_page
+from thermostand.compensation.reporting.pages import validation_page
 from thermostand.compensation.validation3d.document import as_json
 from thermostand.compensation.validation3d.stand_part import StandPart, stand_part
 from thermostand.compensation.validation3d.validate import LensModel, camera_of, check_same, validate

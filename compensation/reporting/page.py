@@ -1,88 +1,128 @@
-"""The parts a report is made of, and the page of them: one HTML file that needs no other (page.html.jinja).
-
-Sections say what is in a part; how it looks is in the template alone, which escapes every text.
+"""Pages by templates: one HTML file that needs no other. What a page says is in its template, how it looks in ui.jinja;
+every text is escaped. Numbers and figures are given to it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import importlib
+import logging
+import math
+from collections.abc import Iterable, Mapping
 from functools import cache
+from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
+from thermostand.compensation.drift.drift_model import Outside
+from thermostand.compensation.drift.evaluation import improvement_percent
 from thermostand.compensation.reporting.drawing.drawing import Draw, one_by_one
+from thermostand.compensation.reporting.numbers import compact, measured, percent, significant, typeset
+from thermostand.compensation.validation3d import paper
+from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validation_text import flagged, reason_names, with_limit
+from thermostand.foundation.errors import ConfigError
+
+NamedFigure = tuple[str, Figure]
+"""The name begins its ids, so that several fit in one page."""
+_ROLLED_DEG = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class Heading:
-    """A heading; 1 is the page's own."""
-
-    text: str
-    level: int = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Paragraph:
-    """A paragraph; an aside is grey."""
-
-    text: str
-    aside: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A table of numbers, texts already formatted; row `chosen` is bold, one of a first cell only heads those below
-    it."""
-
-    heads: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    chosen: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """Names and what belongs to them, a line each."""
-
-    rows: Sequence[tuple[str, str]]
-
-
-@dataclass(frozen=True, slots=True)
-class Listing:
-    """Lines that stand as they are, all letters of one width."""
-
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Drawing:
-    """A figure with its caption; `name` begins its ids, so that several fit in one page."""
-
-    figure: Figure
-    name: str
-    caption: str
-
-
-Part = Heading | Paragraph | Listing | Table | Facts | Drawing
-
-
-def page(title: str, parts: Sequence[Part], draw: Draw = one_by_one) -> str:
-    """A whole HTML page."""
-    svg = iter(draw([(part.figure, part.name) for part in parts if isinstance(part, Drawing)]))
-    named = [(type(part).__name__, part, next(svg) if isinstance(part, Drawing) else "") for part in parts]
-    return _template().render(title=title, parts=named)
+def page(
+    template: str, title: str, figures: Iterable[NamedFigure] = (), draw: Draw = one_by_one, **values: object
+) -> str:
+    """The page of a template as HTML text: of `values`, and `svg`, the figures by their names."""
+    named = list(figures)
+    svg = dict(zip((name for name, _ in named), draw([(figure, name) for name, figure in named]), strict=True))
+    return _environment().get_template(f"{template}.html.jinja").render(title=title, svg=svg, **values)
 
 
 @cache
-def _template() -> Template:
-    loader = PackageLoader("compensation", "reporting")
+def _environment() -> Environment:
     made = Environment(
-        loader=loader,
+        loader=PackageLoader("thermostand.compensation", "reporting"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    return made.get_template("page.html.jinja")
+    made.filters.update(_FILTERS)
+    made.globals.update(paper=paper, flagged=flagged, reasons=_reasons)  # pyright: ignore[reportCallIssue] - as it does
+    return made
+
+
+def mpx(value_px: float, digits: int = 1) -> str:
+    """A dash for what is not known."""
+    return "–" if math.isnan(value_px) else f"{1e3 * value_px:z.{digits}f}"
+
+
+def utc(instant: str) -> str:
+    """ISO 8601 to what is read on a page."""
+    return f"{instant[:16].replace('T', ' ')} UTC"
+
+
+def orientation(roll_deg: float) -> str:
+    """Of a camera, against the first one."""
+    if math.isnan(roll_deg):
+        return "camera"
+    return "normal camera" if abs(roll_deg) < _ROLLED_DEG else f"camera rotated by {abs(roll_deg):z.1f}°"
+
+
+def _each(values: Iterable[float], spec: str, over: float = 1.0) -> list[str]:
+    return [format(value / over, spec) if math.isfinite(value) else "-" for value in values]
+
+
+def _counts(found: Mapping[str, int], *written: str) -> str:
+    return ", ".join(f"{count} {name.replace(*written) if written else name}" for name, count in found.items())
+
+
+def _reasons(validation: Validation) -> list[str]:
+    return reason_names(Outside(int(np.bitwise_or.reduce(validation.flags, axis=None))))
+
+
+_FILTERS: dict[str, Any] = {
+    "to": format,
+    "known": lambda value, spec: format(value, spec) if math.isfinite(value) else "",
+    "is_finite": math.isfinite,
+    "fine": lambda value, limit, digits: f"{value:z.{digits + (value < limit)}f}",
+    "gain": lambda before, after, digits=1: percent(improvement_percent(before, after), digits),
+    "mpx": mpx,
+    "percent": percent,
+    "measured": lambda value, expanded: [*measured(value, expanded)],
+    "significant": significant,
+    "typeset": typeset,
+    "compacts": lambda values, sigmas: [compact(*each) for each in zip(values.tolist(), sigmas.tolist(), strict=True)],
+    "utc": utc,
+    "orientation": orientation,
+    "counts": _counts,
+    "each": _each,
+    "times": lambda values, factor: [factor * value for value in values],
+    "limits": lambda values, sigmas: [with_limit(*each) for each in zip(values, sigmas, strict=True)],
+    "rms": lambda values: np.sqrt(np.nanmean(values**2, axis=0)),
+    "mean": lambda values, axis=(0, 1): np.nanmean(values, axis=axis),
+}
+
+
+def pdf_of(html: str) -> bytes:
+    """A page as a PDF, by WeasyPrint: print rules of the page's own style sheet, no browser, no network. ConfigError
+    when it, or the text library it draws with, is not installed."""
+    try:
+        weasyprint: Any = importlib.import_module("weasyprint")
+    except (ImportError, OSError) as error:
+        raise ConfigError(
+            f"a PDF needs WeasyPrint and Pango ({error}): pip install 'thermostand[pdf]', and on Debian "
+            "apt install libpango-1.0-0 libpangoft2-1.0-0; or write .html and print it"
+        ) from error
+    # It reads figures' styles twice, once as if they were HTML's, and warns of each property.
+    logging.getLogger("weasyprint").setLevel(logging.ERROR)
+    # Nothing outside of the page is looked up: it has everything in it.
+    return bytes(weasyprint.HTML(string=html, url_fetcher=_refused).write_pdf())
+
+
+def _refused(url: str, *_: object, **__: object) -> Any:
+    if url.startswith("data:"):
+        fetch: Any = importlib.import_module("weasyprint.urls").default_url_fetcher
+        return fetch(url)
+    raise ValueError(f"{url[:80]}: a page refers to nothing outside of itself")

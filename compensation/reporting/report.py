@@ -1,42 +1,35 @@
 """The report of a compensation: one HTML file that needs nothing else, its numbers beside it, and the whole way there.
 
-report.json has every number of report.html under the names of compensation/reporting/numbers.py.
+report.json has every number of report.html under the names of numbers.py; report.html.jinja has every sentence.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from thermostand.compensation.budget.budget import Budget, Contribution
+import numpy as np
+
+from thermostand.compensation.drift.candidates import Candidate
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.model_file import save_model
 from thermostand.compensation.observations import Observations, Progress, observe
-from thermostand.compensation.reporting.compensation_section import (
-    compensation_section,
-    model_section,
-    uncertainty_section,
-)
-from thermostand.compensation.reporting.data_section import data_section, utc
+from thermostand.compensation.reporting.drawing import report_figures as figures
 from thermostand.compensation.reporting.drawing.drawing import Draw, one_by_one
-from thermostand.compensation.reporting.drift_section import drift_section
 from thermostand.compensation.reporting.equipment import equipment_of
-from thermostand.compensation.reporting.extras import Extras
-from thermostand.compensation.reporting.gather import numbers_of
-from thermostand.compensation.reporting.numbers import Numbers, as_json
-from thermostand.compensation.reporting.page import Drawing, Heading, Paragraph, Part, Table, page
-from thermostand.compensation.reporting.result_section import result_section
-from thermostand.compensation.reporting.table_positions import TablePositions, positions_figure, table_positions
-from thermostand.compensation.reporting.validation_report import validation_parts
+from thermostand.compensation.reporting.numbers import Extras, Numbers, as_json, numbers_of, table_positions
+from thermostand.compensation.reporting.page import NamedFigure, orientation, page
+from thermostand.compensation.reporting.pages import validation_figures
+from thermostand.compensation.reporting.tracks import Track, cycle, moved_px, visits, warm_ups
 from thermostand.compensation.validation3d.validate import Validation
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import check_writable, write_whole
-from thermostand.markers.target import Target
 from thermostand.recording.reading.session import Session
+
+_MOST_PANELS, _MOST_THERMAL = 4, 10
 
 
 class NoModel(SessionError):
@@ -123,8 +116,7 @@ def write_report(
     drawn. SessionError when the place refuses."""
     extras, path = extras or Extras(), Path(path)
     numbers = numbers_of(observations, model, evaluation, extras)
-    text = _page(observations, evaluation, numbers, extras, draw)
-    write_whole(path, text)
+    write_whole(path, _page(observations, evaluation, numbers, extras, draw))
     write_whole(numbers_path(path), as_json(numbers))
 
 
@@ -142,77 +134,84 @@ def report_page(
 def _page(
     observations: Observations, evaluation: Evaluation | None, numbers: Numbers, extras: Extras, draw: Draw
 ) -> str:
+    has_spots = any(session.spots for session in observations.sessions)
+    drawn = figures_of(observations, evaluation, numbers, extras)
+    return page_of(numbers, drawn, extras.validation, draw, has_spots=has_spots)
+
+
+def page_of(
+    numbers: Numbers,
+    drawn: Iterable[NamedFigure] = (),
+    validation: Validation | None = None,
+    draw: Draw = one_by_one,
+    *,
+    has_spots: bool = False,
+) -> str:
+    """The page of these numbers and figures. has_spots: whether a thermal imager saw the camera."""
     subject = "Thermal drift" if numbers.model is None else "Thermal compensation"
-    title = f"{subject} of camera {numbers.camera}"
-    parts = [Heading(title, 1), Paragraph(_lead(numbers), aside=True), *result_section(numbers, extras.validation)]
-    parts += drift_section(observations, numbers)
-    parts += _compensation(observations, evaluation, numbers)
-    parts += space_section(extras.positions, observations.target, extras.validation)
-    parts += stand_section(numbers)
-    parts += data_section(numbers)
-    return page(title, parts, draw)
-
-
-def _compensation(observations: Observations, evaluation: Evaluation | None, numbers: Numbers) -> Iterator[Part]:
-    if evaluation is not None and numbers.score is not None:
-        yield from compensation_section(observations, evaluation, numbers.score)
-    if numbers.model is not None:
-        yield from model_section(numbers.model)
-    yield from uncertainty_section(numbers)
-
-
-def _lead(numbers: Numbers) -> str:
-    recipes = ", ".join(dict.fromkeys(session.recipe for session in numbers.sessions))
-    begin, end = min(one.begin for one in numbers.sessions), max(one.end for one in numbers.sessions)
-    frames = sum(session.frames for session in numbers.sessions)
-    text = f"Recipe {recipes}, recorded {utc(begin)} to {utc(end)}, {frames} frames."
-    return text + (" Recorded in a simulated laboratory." if numbers.simulated else "")
-
-
-def space_section(positions: TablePositions, target: Target, validation: Validation | None) -> Iterator[Part]:
-    """What there is of it; nothing when the target was never moved on purpose."""
-    if validation is None and not positions.calibration and not positions.poses:
-        return
-    yield Heading("In three dimensions")
-    if positions.calibration or positions.poses:
-        yield Drawing(
-            positions_figure(positions, target),
-            "table",
-            "Where the table held the target, seen from above; the camera looks from the left.",
-        )
-    if validation is not None:
-        yield Paragraph(f"Validated in session {validation.session_id}.", aside=True)
-        yield from validation_parts(validation, level=3)
-
-
-def stand_section(numbers: Numbers) -> Iterator[Part]:
-    """A table for each session whose budget was asked for."""
-    if not numbers.budgets:
-        return
-    yield Heading("The stand's budget")
-    yield Paragraph(
-        "What the stand itself does to the image, at its largest over the session's captures, with standard "
-        "uncertainties; a line without one is a scatter. It is part of the drift above unless it was corrected."
-    )
-    for session_id, budget in numbers.budgets.items():
-        yield Paragraph(f"{session_id}: {_state(budget)}", aside=True)
-        heads = ("contribution", "µm", "± µm", "mpx", "± mpx", "at", "correctable")
-        yield Table(heads, [_line(one) for one in budget.contributions])
-
-
-def _state(budget: Budget) -> str:
-    reference, (low, high) = budget.reference, budget.air_degC
-    return (
-        f"reference with air {reference.air_degC:z.2f} °C, granite {reference.granite_inside_degC:z.2f} °C inside and "
-        f"{reference.granite_outside_degC:z.2f} °C outside, artifact {reference.artifact_degC:z.2f} °C, laboratory "
-        f"{reference.laboratory_degC:z.2f} °C; captures with air of {low:z.1f} to {high:z.1f} °C."
+    tried = () if numbers.model is None else numbers.model.candidates
+    paper, others = ([one for one in tried if (one.form == "paper") is is_paper] for is_paper in (True, False))
+    others.sort(key=lambda one: (not one.chosen, _held_out(one)))
+    return page(
+        "report",
+        f"{subject} of camera {numbers.camera}",
+        drawn,
+        draw,
+        n=numbers,
+        validation=validation,
+        candidates=[*paper, *others],
+        listed_candidates=len(paper) + _MOST_THERMAL,
+        best=[min(ones, key=_held_out) for ones in (paper, others) if ones],
+        enlarged=figures.EXAGGERATION,
+        curve_points=figures.CURVE_POINTS,
+        roles={role for session in numbers.sessions for role in session.frames_by_role},
+        moved_roles=set(figures.MOVED_ON_PURPOSE),
+        has_spots=has_spots,
+        drawn_warm_ups=_MOST_PANELS,
     )
 
 
-def _line(one: Contribution) -> tuple[str, ...]:
-    numbers = (_number(one.um), _number(one.u_um), _number(1e3 * one.px), _number(1e3 * one.u_px))
-    return (one.name, *numbers, one.where, "yes" if one.corrected else "")
+def _held_out(one: Candidate) -> float:
+    return float(one.fold_squares.mean())
 
 
-def _number(value: float) -> str:
-    return f"{value:z.2f}" if math.isfinite(value) else ""
+def figures_of(
+    observations: Observations, evaluation: Evaluation | None, numbers: Numbers, extras: Extras
+) -> Iterator[NamedFigure]:
+    """Warm-up, cycle and the whole recording, what the model makes of it, and where the table was; what was not
+    recorded has no figure."""
+    if np.isfinite(moved_px(observations)).any():
+        yield from _drift_figures(observations, numbers)
+    if evaluation is not None:
+        yield "compensated", figures.compensated_paths(observations, evaluation)
+        yield "residual-map", figures.residual_map(observations, evaluation)
+        yield "fit", figures.measured_against_model(evaluation)
+        yield "residuals", figures.residuals(evaluation)
+        yield "histogram", figures.histogram(evaluation)
+        yield "temperature", figures.against_temperature(evaluation)
+    if extras.positions.calibration or extras.positions.poses:
+        yield "table", figures.positions_figure(extras.positions, observations.target)
+    if extras.validation is not None:
+        yield from validation_figures(extras.validation)
+
+
+def _drift_figures(observations: Observations, numbers: Numbers) -> Iterator[NamedFigure]:
+    if shown := warm_ups(observations)[:_MOST_PANELS]:
+        rolls_deg = [one.track.roll_deg - shown[0].track.roll_deg for one in shown]
+        titles = [orientation(roll_deg) if len(numbers.warm_ups) > 1 else "" for roll_deg in rolls_deg]
+        yield "warm-up-curves", figures.warm_up_curves(observations, shown, titles)
+        panels = [_panel(observations, one.track, title) for one, title in zip(shown, titles, strict=True)]
+        yield "warm-up-paths", figures.trajectories(observations, panels)
+    gaps = [
+        {one.session_id: one.gaps for one in found} for found in (numbers.hysteresis_before, numbers.hysteresis_after)
+    ]
+    for index, facts in enumerate(observations.sessions):
+        if (track := cycle(observations, index)) is not None:
+            yield f"cycle-{index}", figures.trajectories(observations, [_panel(observations, track, "")])
+            before, after = gaps[0][facts.session_id], gaps[1].get(facts.session_id, ())
+            yield f"branches-{index}", figures.branches(visits(observations, track), before, after)
+    yield "time", figures.against_time(observations)
+
+
+def _panel(observations: Observations, track: Track, title: str) -> figures.Paths:
+    return figures.Paths(title, track.start_px, track.moved_px, observations.camera_degC[track.frames])

@@ -20,7 +20,7 @@ from thermostand.compensation.drift_runtime import Drift
 from thermostand.compensation.drift_runtime import compiled as worked_out
 from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, in_c, in_words, lag, play
 from thermostand.compensation.history.states import States, row_of, state_of
-from thermostand.compensation.reporting.formula import formula_of
+from thermostand.compensation.reporting.numbers import formula_of
 from thermostand.foundation.errors import ConfigError, SessionError
 
 from .compiled_header import COMPILER, compiled, said

@@ -17,7 +17,7 @@ from thermostand.compensation.calibration.seen_area import NOT_SEEN
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.compensation.calibration.uncertainty import difference, projection_uncertainty
 from thermostand.compensation.commands.calibration_cli import summary
-from thermostand.compensation.reporting.calibration_report import report_page
+from thermostand.compensation.reporting.pages import calibration_page
 from thermostand.compensation.validation3d.validate import LensModel, camera_of
 from thermostand.foundation.errors import CalibrationError
 
@@ -86,7 +86,7 @@ def test_few_positions_give_a_camera_though_their_halves_give_none(laboratories:
     assert (found.model, found.halves, len(found.not_known)) == (BROWN, None, 1)
     file = camera_file(found, camera_serial="1", session_ids=("a",), target_name="drawn", software_version="0")
     assert file.uncertainty.halves_rms_px is None
-    assert file.not_known[0] in report_page(file, found)
+    assert file.not_known[0] in calibration_page(file, found)
     assert file.not_known[0] in summary(file, target_of(laboratories[1]))
 
 
@@ -109,7 +109,7 @@ def test_of_a_wide_lens_what_nobody_saw_and_rays_that_do_not_describe_it_are_not
     assert np.nanmax(sigma_px) < 0.5
     assert file.uncertainty.not_seen == NOT_SEEN
     assert NOT_SEEN in summary(file, target_of(laboratory))
-    page = report_page(file, found)
+    page = calibration_page(file, found)
     assert file.rays_doubt in page
     assert "not seen here" in page
 

@@ -21,8 +21,8 @@ from thermostand.compensation.datasheet.warming import frame_noise, warming_quan
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.observations import Observations
-from thermostand.compensation.reporting.datasheet_page import datasheet_json, datasheet_page
 from thermostand.compensation.reporting.numbers import compact, measured, percent, significant
+from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page
 from thermostand.foundation.errors import ConfigError
 
 from .conftest import Recorded

@@ -20,17 +20,16 @@ from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.drift.terms import features
 from thermostand.compensation.history.states import States
 from thermostand.compensation.observations import Observations
-from thermostand.compensation.reporting.compensation_section import uncertainty_section
-from thermostand.compensation.reporting.data_section import data_section
 from thermostand.compensation.reporting.drawing.figures import enlarged
-from thermostand.compensation.reporting.drawing.fit_figures import measured_against_model
-from thermostand.compensation.reporting.extras import Extras
-from thermostand.compensation.reporting.formula import formula_of
-from thermostand.compensation.reporting.gather import numbers_of
-from thermostand.compensation.reporting.numbers import Numbers, as_json
-from thermostand.compensation.reporting.page import page as page_of
-from thermostand.compensation.reporting.report import can_be_fitted, check_report_writable, report_page, write_report
-from thermostand.compensation.reporting.result_section import result_section
+from thermostand.compensation.reporting.drawing.report_figures import measured_against_model
+from thermostand.compensation.reporting.numbers import Extras, Numbers, as_json, formula_of, numbers_of
+from thermostand.compensation.reporting.report import (
+    can_be_fitted,
+    check_report_writable,
+    page_of,
+    report_page,
+    write_report,
+)
 from thermostand.foundation.errors import SessionError
 
 from .made_up_models import thermal
@@ -190,14 +189,14 @@ def test_the_uncertainty_is_what_noise_and_model_make(numbers: Numbers):
     assert score is not None
     np.testing.assert_allclose(score.marker_sigma_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=1e-6)
     assert (np.array(score.claimed_sigma_px) >= score.marker_sigma_px).all()
-    assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in page_of("", list(uncertainty_section(numbers)))
+    assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in page_of(numbers)
 
 
 def test_an_interval_that_claims_too_much_is_reported(numbers: Numbers):
     assert numbers.score is not None
     too_few = replace(numbers, score=replace(numbers.score, coverage_95=(0.96, 0.34)))
-    assert "thermal lag, hysteresis" not in page_of("", list(result_section(numbers)))
-    assert "thermal lag, hysteresis" in page_of("", list(result_section(too_few)))
+    assert "thermal lag, hysteresis" not in page_of(numbers)
+    assert "thermal lag, hysteresis" in page_of(too_few)
 
 
 def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers):
@@ -209,7 +208,7 @@ def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers
         (two, "", "fitted, of 2 compared"),
         (numbers.model, "is not known", ""),  # of the paper's form
     ):
-        page = page_of("", list(uncertainty_section(replace(numbers, model=model))))
+        page = page_of(replace(numbers, model=model))
         assert (f"How well nights repeat {said}" in page) == bool(said)
         assert ("How well nights repeat" in page) == bool(said)
         assert ("added by a night that was not" in page) == bool(row)
@@ -375,6 +374,6 @@ def test_doubtful_frames_are_named_when_they_are_more_than_noise_alone_gives(num
     def says_doubtful(frames: int, doubtful: int) -> bool:
         (session, *_) = numbers.sessions
         own = replace(numbers, sessions=(replace(session, frames=frames, doubtful=doubtful),), unusable=())
-        return "frames are not described by" in page_of("", list(data_section(own)))
+        return "frames are not described by" in page_of(own)
 
     assert [says_doubtful(*case) for case in ((60, 1), (60, 2), (1000, 20), (1000, 21))] == [False, True, False, True]

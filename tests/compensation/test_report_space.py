@@ -10,18 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.reporting.extras import Extras
-from thermostand.compensation.reporting.gather import numbers_of
-from thermostand.compensation.reporting.page import page as page_of
-from thermostand.compensation.reporting.report import report_page, space_section
-from thermostand.compensation.reporting.table_positions import TablePositions, table_positions
+from thermostand.compensation.reporting.numbers import Extras, TablePositions, numbers_of, table_positions
+from thermostand.compensation.reporting.report import report_page
 from thermostand.compensation.validation3d.deviations import Deviations
 from thermostand.compensation.validation3d.document import as_json, load_validation
 from thermostand.compensation.validation3d.validate import Validation
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark, StepState
 
-from .synthetic import TARGET, observations, quadratic
+from .synthetic import observations, quadratic
 
 TEMPERATURES, POSITIONS = 3, 2
 PLACES = ((70.0, 0.0), (95.0, 8.0))
@@ -145,9 +142,12 @@ def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validat
 
 
 def test_a_target_that_never_moved_has_no_such_section():
-    assert not list(space_section(TablePositions(), TARGET, None))
-    drawn = page_of("", list(space_section(TablePositions(poses=PLACES), TARGET, None)))
+    night = observations(quadratic, 0.005)
+    night = replace(night, role=np.full(len(night.role), "calibration"))
+    assert "In three dimensions" not in report_page(night, None, None)
+    drawn = report_page(night, None, None, Extras(positions=TablePositions(poses=PLACES)))
     assert drawn.count("<svg") == 1
+    assert "In three dimensions" in drawn
     assert "Table 1" not in drawn
 
 

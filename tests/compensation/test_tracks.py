@@ -9,9 +9,9 @@ import pytest
 
 from thermostand.compensation.history.thermal_history import History
 from thermostand.compensation.observations import Observations, concatenate
-from thermostand.compensation.reporting.drawing import drift_figures
+from thermostand.compensation.reporting.drawing import report_figures
 from thermostand.compensation.reporting.drawing.figures import as_svg
-from thermostand.compensation.reporting.drawing.path_figures import Paths, trajectories
+from thermostand.compensation.reporting.drawing.report_figures import Paths, trajectories
 from thermostand.compensation.reporting.tracks import cycle, moved_px, thinned, visits, warm_ups
 from thermostand.experiments.steps import Role
 
@@ -127,7 +127,7 @@ def test_figures_bear_missing_frames_and_temperatures():
     track = cycle(holes, 0)
     assert track is not None
     paths = Paths("", track.start_px, track.moved_px, holes.camera_degC[track.frames])
-    for figure in (trajectories(holes, [paths]), drift_figures.against_time(holes)):
+    for figure in (trajectories(holes, [paths]), report_figures.against_time(holes)):
         assert as_svg(figure, "holes").startswith("<svg")
 
 
@@ -136,8 +136,8 @@ def test_what_a_thermal_imager_saw_stands_beneath_the_drift():
     times_ns = np.linspace(night.time_ns[0] - 10**12, night.time_ns[-1] + 10**12, 1000).astype(np.int64)
     spots = {"lens": (times_ns, np.linspace(30.0, 50.0, 1000)), "back": (times_ns, np.full(1000, np.nan))}
     without, seen = night, replace(night, sessions=(replace(facts(), spots=spots),))
-    assert len(drift_figures.against_time(without).axes) == 2
-    *_, foot = drift_figures.against_time(seen).axes
+    assert len(report_figures.against_time(without).axes) == 2
+    *_, foot = report_figures.against_time(seen).axes
     lens, _ = foot.lines
     hours = (night.time_ns[-1] - night.time_ns[0]) / 3.6e12
     shown = np.asarray(lens.get_xdata(), np.float64)

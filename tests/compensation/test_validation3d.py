@@ -19,7 +19,7 @@ from thermostand.compensation.drift.drift_model import Outside
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.observations import Float
-from thermostand.compensation.reporting.validation_report import validation_page
+from thermostand.compensation.reporting.pages import validation_page
 from thermostand.compensation.validation3d.deviations import Camera, Deviations, deviations
 from thermostand.compensation.validation3d.document import as_json
 from thermostand.compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
