@@ -72,14 +72,10 @@ def installed() -> Iterator[str]:
 
 
 def headings() -> Iterator[str]:
-    """Of reports, from the sources: what is given to Heading as it stands."""
-    for path in (ROOT / "compensation").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Heading":
-                text = node.args[0]
-                for each in (text.body, text.orelse) if isinstance(text, ast.IfExp) else (text,):
-                    if isinstance(each, ast.Constant):
-                        yield f'"{each.value}"'
+    """Of pages, from their templates: what stands in a heading, or one of two texts."""
+    for path in (ROOT / "compensation" / "reporting").glob("*.jinja"):
+        for text in re.findall(r"<h(?:[23]|{{ level }})>(.*?)</h", path.read_text("utf-8")):
+            yield from ([f'"{text}"'] if "{{" not in text else re.findall(r'"[A-Z][^"]+"', text))
 
 
 @cache
