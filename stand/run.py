@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
-from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
+import fcntl
+import os
+from collections.abc import AsyncGenerator, Awaitable, Callable, Generator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import yaml
+
+from thermostand.drivers.devices.motion.flap import FlapSettings
+from thermostand.drivers.devices.protocols import Camera
+from thermostand.drivers.settings import CameraSettings, OnBus
 from thermostand.foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
-from thermostand.foundation.errors import Interrupted, SessionError, StandError, StandTripped
+from thermostand.foundation.errors import ConfigError, Interrupted, Refused, SessionError, StandError, StandTripped
 from thermostand.foundation.events import (
     JOURNAL_DAMAGED,
     LIMITS_ACCEPTED,
+    NO_CAMERA_TEMPERATURE,
     NO_CONTROL,
     NOTIFY_FAILED,
     SALVAGED,
@@ -23,6 +32,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.instants import utc_text
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.progress import late_progress
+from thermostand.foundation.readings import Quality
 from thermostand.foundation.repeats import RepeatLimit
 from thermostand.foundation.tasks import cancelled, cause_of, failure_text
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
@@ -31,17 +41,15 @@ from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WIT
 from thermostand.recording.writing.recorder_settings import SessionInfo
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.safe_ranges import accepted_text
+from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.running.guest import Guest, Job
 from thermostand.stand.running.opening.claim import claimed
 from thermostand.stand.running.opening.clock_watch import ClockWatch
-from thermostand.stand.running.opening.one_cpu import one_cpu
 from thermostand.stand.running.opening.open_stand import OpenStand, Time, opened
 from thermostand.stand.running.opening.stand_latch import StandLatch
 from thermostand.stand.running.opening.stop import Stop
-from thermostand.stand.running.opening.temperature_check import check_temperature
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
-from thermostand.stand.running.order import Order
-from thermostand.stand.running.rehearsal import rehearsed
+from thermostand.stand.running.order import Order, with_register_maps
 from thermostand.stand.running.resume import Interruption, interruption, is_of_virtual_time
 from thermostand.stand.running.session_files import (
     camera_serials,
@@ -55,6 +63,154 @@ from thermostand.stand.serving.alerts import alerting
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
+
+# A real stand's file as a rehearsal: the simulated laboratory answers in the place of its devices.
+
+_FOUND_BY = {"address", "width_px", "height_px"}  # of a camera: where it is, and what the simulated sensor may not have
+_HEAD = "# A rehearsal of this stand's file: the simulated laboratory in the place of its devices.\n"
+
+
+def rehearsed(order: Order) -> Order:
+    """The order on the simulated laboratory. Kept: limits, thermometers, axes, contacts, what the guard allows, what
+    the cameras are asked for, and the recipe. Replaced: addresses, and the units on the bus by those that the
+    laboratory has; nobody is notified. An order of a simulated stand stays as it is. ConfigError for an axis that it
+    does not have."""
+    config = order.config
+    if config.simulation is not None:
+        return order
+    there = load_config(packaged("", "simulated"))
+    if strange := sorted(config.axes.keys() - there.axes.keys()):
+        known = ", ".join(there.axes)
+        raise ConfigError(f"{config.name}: the simulated laboratory has no axis {strange[0]}, only {known}")
+    update: dict[str, Any] = {
+        "bus": there.bus,
+        "regulator": _at(config.regulator_unit, "omron-e5cc") if config.regulator_unit else config.regulator,
+        "relays": config.relays and _at(config.relays, "waveshare-relay"),
+        "heat_module": config.heat_module and _at(config.heat_module, "icpdas-m7024"),
+        "climate_chamber": config.climate_chamber and config.climate_chamber.model_copy(update={"address": _CHAMBER}),
+        "thermometer_module": _at(config.thermometer_module, there.thermometer_module.registers),
+        "inputs": config.inputs and _at(config.inputs, "waveshare-inputs"),
+        "axes": {
+            name: axis.model_copy(update={"address": there.axes[name].address}) for name, axis in config.axes.items()
+        },
+        "probes": {
+            name: probe.model_copy(update={"address": f"tcp:127.0.0.1:{_PROBES + number}"})
+            for number, (name, probe) in enumerate(config.probes.items())
+        },
+        "devices": {
+            name: device.model_copy(update={"address": f"tcp:127.0.0.1:{_PROBES + len(config.probes) + number}"})
+            for number, (name, device) in enumerate(config.devices.items())
+        },
+        "flap": config.flap and _flap(config.flap, there.flap),
+        "cameras": {name: _camera(camera, there.cameras["camera"]) for name, camera in config.cameras.items()},
+        "guard": config.guard.model_copy(update={"notify": ()}),
+        "compressor": config.compressor.model_copy(update={"state_file": None}),
+        "alerts": there.alerts,
+        "simulation": there.simulation,
+    }
+    rehearsal = StandConfig.model_validate(config.model_copy(update=update).model_dump(mode="json", exclude_none=True))
+    text = _HEAD + yaml.safe_dump(rehearsal.model_dump(mode="json", exclude_none=True), sort_keys=False)
+    return with_register_maps(replace(order, config=rehearsal, config_text=text))
+
+
+_CHAMBER = "tcp:127.0.0.1:15023"
+_PROBES = 15024  # and on
+
+
+def _at(unit: OnBus, registers: str) -> OnBus:
+    return unit.model_copy(update={"registers": registers})
+
+
+def _flap(own: FlapSettings, there: FlapSettings | None) -> FlapSettings:
+    return own.model_copy(
+        update={name: getattr(there, name) for name in ("backend", "backend_address")} if there is not None else {}
+    )
+
+
+def _camera(own: CameraSettings, there: CameraSettings) -> CameraSettings:
+    """The simulated camera, asked for what this stand asks of its own."""
+    names = CameraSettings.model_fields.keys() - _FOUND_BY
+    return there.model_copy(update={name: getattr(own, name) for name in names})
+
+
+# A virtual run and its simulator on one CPU, which no other virtual run of this machine has taken.
+
+_CPU_FOLDER = "/sys/devices/system/cpu/cpu{}"
+
+
+@contextmanager
+def one_cpu() -> Generator[None]:
+    """Inside, this process and its children (the simulator) run on one of the CPUs they may use.
+
+    In virtual time daemon and simulator take turns, a dozen in each polled second, and never work at once. On one CPU a
+    turn is a switch of context; on two it is waking an idle CPU, which takes longer than the answer. Runs side by side
+    take different CPUs as long as there are any left.
+    """
+    usable = os.sched_getaffinity(0)
+    cpu, folder = _take(sorted(usable))
+    _use({cpu})
+    try:
+        yield
+    finally:
+        _use(usable)
+        if folder is not None:
+            os.close(folder)
+
+
+def _take(cpus: Sequence[int]) -> tuple[int, int | None]:
+    """The first of `cpus` that no other run has taken, and the descriptor that keeps it; when there is none, one by the
+    process' number.
+
+    It is taken by a lock on the kernel's own folder for that CPU: no file is left anywhere, and the lock ends with the
+    process however that ends.
+    """
+    for cpu in cpus:
+        try:
+            folder = os.open(_CPU_FOLDER.format(cpu), os.O_RDONLY)
+        except OSError:  # a system without these folders
+            continue
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # taken
+            os.close(folder)
+        else:
+            return cpu, folder
+    return cpus[os.getpid() % len(cpus)], None
+
+
+def _use(cpus: set[int]) -> None:
+    """Every thread of this process: one that waits for work in a pool would start the simulator elsewhere."""
+    for thread in os.listdir("/proc/self/task"):
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            os.sched_setaffinity(int(thread), cpus)
+
+
+# Checked before the first step: the camera's own temperature, without which no frame is of use.
+
+_TRIES, _PAUSE_S = 3, 1.0
+
+
+async def check_temperature(camera: Camera, hub: Hub, clock: Clock) -> None:
+    """The camera, which is open, shows its temperature, or is configured to have none, which is reported.
+
+    Refused, with the feature and what the camera offers, when three readings in a row are BAD.
+    """
+    if not camera.settings.has_temperature:
+        hub.publish(NO_CAMERA_TEMPERATURE.at(clock.now_ns()))
+        return
+    (reading,) = await camera.read()
+    for _ in range(_TRIES - 1):
+        if reading.quality is not Quality.BAD:
+            return
+        await clock.sleep_until(clock.now_ns() + seconds_ns(_PAUSE_S))
+        (reading,) = await camera.read()
+    if reading.quality is Quality.BAD:
+        place = await camera.temperature_place()
+        keys = f"cameras.{camera.name}"
+        remedy = f"correct {keys}.temperature in the configuration, or say {keys}.has_temperature: false there"
+        where = f" ({place})" if place else ""
+        raise Refused(camera.name, f"its temperature is BAD before the first step: {reading.reason}{where}; {remedy}")
+
 
 __all__ = ["Interrupted", "resume", "run_in", "run_real", "run_virtual"]
 
@@ -72,7 +228,7 @@ async def run_virtual(
 ) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
-    Of a real stand's file the devices are replaced (rehearsal.py).
+    Of a real stand's file the devices are replaced.
     The laboratory takes free addresses, not the configured ones: any number of virtual runs go side by side.
     The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start;
     `begun` gets the folder as soon as a run that is killed could be resumed in it.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 from collections.abc import AsyncGenerator, Callable, Generator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
@@ -15,16 +17,15 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.command_app import App
 from thermostand.foundation.documents import read_document
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.events import KINDS, LOOPBACK_TRUSTED, OPEN
+from thermostand.foundation.events import KINDS, LOOPBACK_TRUSTED, OPEN, TOKENS_NOT_READ, TOKENS_READ
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.output import Output, json_line, output, say
 from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.checked_cli import warn_unchecked
 from thermostand.stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
-from thermostand.stand.commands.reloading import Reloading
 from thermostand.stand.config.checked import ATTACHMENT, load_checked
-from thermostand.stand.config.interface_section import load_tokens
+from thermostand.stand.config.interface_section import TokenFile, load_tokens
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.order import optics_texts
@@ -38,6 +39,66 @@ from thermostand.stand.serving.secop.door import door_at
 from thermostand.stand.serving.viewing import Viewing
 from thermostand.stand.watching.aside import aside
 from thermostand.stand.watching.remedies import next_command
+
+# SIGHUP to a daemon: its tokens are read again. From a terminal that is closed it ends the daemon, as SIGTERM does.
+
+Tell = Callable[[Event], None]
+
+
+class Reloading:
+    """From `begin` on; to be used on the control loop. path: of the tokens, None where no file is named."""
+
+    def __init__(self, path: Path | None, book: TokenBook, now_ns: Callable[[], int], tell: Tell) -> None:
+        self._path, self._book = path, book
+        self._now_ns, self._tell = now_ns, tell
+        self._reading: asyncio.Task[None] | None = None
+        self._is_asked = False
+        self._had_terminal = _has_terminal() and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+
+    def begin(self) -> None:
+        """SIGHUP comes here."""
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hung_up)
+
+    def _hung_up(self) -> None:
+        if self._had_terminal and not _has_terminal():
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
+        self._is_asked = True
+        if self._reading is None or self._reading.done():
+            self._reading = asyncio.create_task(self._read())
+
+    async def _read(self) -> None:
+        while self._is_asked:
+            self._is_asked = False
+            try:
+                event = self._renewed(await asyncio.to_thread(self._load))
+            except ConfigError as error:
+                event = TOKENS_NOT_READ.at(self._now_ns(), str(error))
+            self._tell(event)
+
+    def _load(self) -> TokenFile:
+        if self._path is None:
+            raise ConfigError("SIGHUP reads tokens again, and the stand's file names none (interface.secrets)")
+        return load_tokens(self._path)
+
+    def _renewed(self, known: TokenFile) -> Event:
+        before, now = (self._book.known or TokenFile()).by_name(), known.by_name()
+        self._book.renew(known)
+        revoked = sorted(name for name, token in before.items() if now.get(name) != token)
+        added = sorted(name for name, token in now.items() if before.get(name) != token)
+        changes = [f"{name} is let in" for name in added]
+        changes += [f"{name} is not let in any more" for name in revoked if name not in now]
+        said = ", ".join(changes) or "nothing has changed"
+        return TOKENS_READ.at(self._now_ns(), said, added=added, revoked=revoked)
+
+
+def _has_terminal() -> bool:
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC))
+    except OSError:
+        return False
+    return True
+
 
 app = App()
 _HERE = "127.0.0.1"

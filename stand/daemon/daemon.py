@@ -42,8 +42,7 @@ from thermostand.recording.writing.recorder import FINISH_WITHIN_S
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.daemon import systemd
 from thermostand.stand.daemon.by_hand import ByHand
-from thermostand.stand.daemon.counters import Counters
-from thermostand.stand.daemon.daemon_file import Kept, KeptFile
+from thermostand.stand.daemon.daemon_file import Counters, Kept, KeptFile
 from thermostand.stand.daemon.day_record import DayRecord
 from thermostand.stand.estimating.learned import learn
 from thermostand.stand.fault import Fault

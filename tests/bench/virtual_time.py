@@ -20,8 +20,7 @@ from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
-from thermostand.stand.run import run_virtual
-from thermostand.stand.running.opening.one_cpu import one_cpu
+from thermostand.stand.run import one_cpu, run_virtual
 from thermostand.stand.running.order import Order
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 

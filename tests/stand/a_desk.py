@@ -17,8 +17,8 @@ from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.gate import INTERLOCK, OPERATOR, Gate
+from thermostand.stand.running.course import check_edit
 from thermostand.stand.running.memory.state import RunState
-from thermostand.stand.running.plan_check import check_edit
 from thermostand.stand.service import (
     CancelRequest,
     DeviceRequest,

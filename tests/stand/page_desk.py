@@ -22,9 +22,9 @@ from thermostand.foundation.readings import Frame, Reading, bad_reading
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import INTERLOCK, OPERATOR
+from thermostand.stand.running.course import check_edit
 from thermostand.stand.running.memory.entries import Step as StepMarked
 from thermostand.stand.running.memory.fold import fold
-from thermostand.stand.running.plan_check import check_edit
 from thermostand.stand.service import ExtendRequest, PauseRequest, SkipRequest
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.desk import (

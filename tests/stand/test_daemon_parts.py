@@ -13,9 +13,8 @@ from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.daemon import systemd
-from thermostand.stand.daemon.counters import Counters
-from thermostand.stand.daemon.daemon_file import Kept, KeptFile, kept_in
-from thermostand.stand.daemon.reports import Reports
+from thermostand.stand.daemon.daemon_file import Counters, Kept, KeptFile, kept_in
+from thermostand.stand.daemon.serve import Reports
 
 
 def read(hub: Hub, time_s: float, **values: float) -> None:

@@ -4,7 +4,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import ETA_SLIPPED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, StepMark, StepState
-from thermostand.stand.serving.eta_slip import EtaSlip
+from thermostand.stand.running.status import EtaSlip
 
 
 class Night:

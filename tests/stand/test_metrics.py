@@ -8,7 +8,7 @@ from pathlib import Path
 from tests.stand.a_desk import ADesk
 from tests.stand.test_interface import STATUS
 from thermostand.stand.serving.api.bridge import Bridge, Snapshot
-from thermostand.stand.serving.api.metrics import metrics
+from thermostand.stand.serving.api.reads import metrics
 from thermostand.stand.serving.desk import FaultState, HeatByHand, QueuedRun
 
 _SAMPLE = re.compile(r'(thermostand_[a-z_]+)(\{([a-z_]+="(\\.|[^"\\\n])*",?)*\})? (-?[0-9.e+-]+)')

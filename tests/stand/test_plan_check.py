@@ -10,9 +10,9 @@ from pydantic import JsonValue
 from tests.stand.a_desk import ADesk, served
 from thermostand.experiments.steps import Capture, OpenFlap, Soak, StartChamber, StopChamber, number_steps
 from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.running.course import check_edit, steps_of
 from thermostand.stand.running.memory.entries import Step
 from thermostand.stand.running.memory.fold import fold
-from thermostand.stand.running.plan_check import check_edit, steps_of
 from thermostand.stand.serving.client import server_of
 from thermostand.stand.serving.desk import WrittenStep
 

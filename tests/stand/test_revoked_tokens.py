@@ -20,7 +20,7 @@ from tests.stand.secop_desk import SecopDesk
 from tests.stand.secop_talk import talking
 from tests.stand.test_interface_access import LOOKS, PROXIED, TOKEN, ask
 from thermostand.foundation.items import Event
-from thermostand.stand.commands.reloading import Reloading
+from thermostand.stand.commands.serve_cli import Reloading
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
 from thermostand.stand.serving.api.access import COOKIE, STOP_PATH
 from thermostand.stand.serving.api.doors import Interface
@@ -190,7 +190,7 @@ ON_A_TERMINAL = """
 import asyncio, os, signal, sys
 os.setsid()
 terminal = os.open(sys.argv[1], os.O_RDWR)  # it is the session's from now on
-from thermostand.stand.commands.reloading import Reloading
+from thermostand.stand.commands.serve_cli import Reloading
 from thermostand.stand.serving.api.token_book import TokenBook
 
 async def main():

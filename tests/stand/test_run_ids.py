@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.stand.running.memory.ids import Ids
+from thermostand.stand.running.memory.state import Ids
 
 IDS = st.sampled_from([f"step-{number}" for number in range(40)])
 

@@ -24,9 +24,8 @@ from thermostand.stand.estimating.run_estimate import Night
 from thermostand.stand.running.status import doing_in_words
 from thermostand.stand.serving.desk import HeatByHand, ReadingState, StandState
 from thermostand.stand.watching.follow import Follow
-from thermostand.stand.watching.live import Foot, Lines
+from thermostand.stand.watching.live import Foot, Lines, panel_lines, plain_line
 from thermostand.stand.watching.moment import Moment, moment_of
-from thermostand.stand.watching.panel import panel_lines, plain_line
 from thermostand.stand.watching.remedies import next_command
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S  # 2026-01-01 18:00:00 UTC

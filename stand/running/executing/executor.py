@@ -22,7 +22,15 @@ from thermostand.experiments.steps import (
 from thermostand.experiments.steps import Step as PlanStep
 from thermostand.foundation.clock import NS_PER_S, Clock
 from thermostand.foundation.errors import ConfigError, DeviceError, Superseded
-from thermostand.foundation.events import PLAN_CHANGED, STEP_BROKEN_OFF, UNDECIDED, WARM_UP_GAP
+from thermostand.foundation.events import (
+    PLAN_CHANGED,
+    RESTORED,
+    SOAK_CREDITED,
+    SOAK_RESTARTED,
+    STEP_BROKEN_OFF,
+    UNDECIDED,
+    WARM_UP_GAP,
+)
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.tasks import cancelled, first_of
@@ -49,10 +57,10 @@ from thermostand.stand.running.executing.actions import (
     is_lossy,
     next_action,
     next_due_ns,
+    worth_of_soaks,
 )
 from thermostand.stand.running.executing.camera_gap import OffsetWatch
 from thermostand.stand.running.executing.deciding import Decided, change_of_plan, fixed_plan
-from thermostand.stand.running.executing.restoring import restore
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
 from thermostand.stand.running.executing.soaking import Soaking
 from thermostand.stand.running.memory.entries import (
@@ -60,8 +68,10 @@ from thermostand.stand.running.memory.entries import (
     Change,
     Cooled,
     Due,
+    Dwell,
     Extended,
     Readying,
+    Restored,
     Skipped,
     Step,
     Taken,
@@ -70,8 +80,39 @@ from thermostand.stand.running.memory.entries import (
 )
 from thermostand.stand.running.memory.fold import after, change_text, refusal
 from thermostand.stand.running.memory.journal import Logbook
-from thermostand.stand.running.memory.state import Plan, RunState
+from thermostand.stand.running.memory.state import Plan, RunState, SetUp
 from thermostand.stand.stand import Stand
+
+# Brings about again what the steps so far have set up, after something has undone it.
+
+
+async def restore(
+    stand: Stand, log: Logbook, clock: Clock, set_up: SetUp, surroundings: Callable[[], Surroundings]
+) -> None:
+    """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
+    disturbances = log.state.disturbances
+    await stand.imaging.close_flap()
+    for planned in set_up.others.values():
+        await stand.gate.passed()
+        await planned.step.perform(stand)
+    for axis, position in set_up.positions.items():
+        await stand.gate.passed()
+        await stand.table.move_to(axis, position)
+    await stand.gate.passed()
+    if set_up.camera_on:
+        await stand.imaging.supply.restore()
+    else:
+        await stand.imaging.power_camera(on=False)
+    if set_up.chamber_degC is not None:
+        await stand.gate.passed()
+        worth, now_ns = worth_of_soaks(log.state, set_up, surroundings()), clock.now_ns()
+        if worth.lost:
+            await log.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in worth.lost))
+        if worth.text:
+            log.tell(SOAK_RESTARTED if worth.lost else SOAK_CREDITED, worth.text)
+        await stand.chamber.start(set_up.chamber_degC)
+    log.enter(Restored(clock.now_ns(), disturbances))
+    log.tell(RESTORED, set_up.text)
 
 
 def unguarded(error: DeviceError) -> None:

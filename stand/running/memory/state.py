@@ -6,8 +6,9 @@ It is folded from the run's entries (fold.py); what to do next is read from it
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from types import MappingProxyType
 
 from thermostand.experiments.steps import (
@@ -26,7 +27,47 @@ from thermostand.experiments.steps import (
 )
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.stand.running.memory.entries import Change, Edited, Ended
-from thermostand.stand.running.memory.ids import Ids
+
+# Ids of steps, as an immutable set to which one is added quickly: a plan may have 100,000 steps.
+
+
+class Ids(Set[str]):
+    """Disjoint parts, each larger than the one behind it, as the digits of a binary counter: adding copies an id about
+    log2(n) times over a whole run, where a frozenset would copy all of them each time."""
+
+    __slots__ = ("_parts",)
+
+    def __init__(self, ids: Iterable[str] = ()) -> None:
+        first = frozenset(ids)
+        self._parts: tuple[frozenset[str], ...] = (first,) if first else ()
+
+    def __contains__(self, step_id: object) -> bool:
+        return any(step_id in part for part in self._parts)
+
+    def __iter__(self) -> Iterator[str]:
+        return chain.from_iterable(self._parts)
+
+    def __len__(self) -> int:
+        return sum(map(len, self._parts))
+
+    def __repr__(self) -> str:
+        return f"Ids({sorted(self)})"
+
+    def plus(self, step_id: str) -> Ids:
+        """With this one."""
+        if step_id in self:
+            return self
+        parts, last = list(self._parts), frozenset((step_id,))
+        while parts and len(parts[-1]) <= len(last):
+            last |= parts.pop()
+        more = Ids()
+        more._parts = (*parts, last)
+        return more
+
+    def minus(self, gone: Set[str]) -> Ids:
+        """Without those."""
+        return Ids(step_id for step_id in self if step_id not in gone)
+
 
 Plan = tuple[PlannedStep, ...]
 
