@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from thermostand.compensation.finding.finder import Finder
 from thermostand.compensation.finding.piece import FoundMarkers, joined, pieces_of
 from thermostand.compensation.history.thermal_history import History, recorded_history
-from thermostand.compensation.one_camera import others_ns, serial_of, take
+from thermostand.compensation.one_camera import channel_of, own_frames, serial_of, take
 from thermostand.compensation.one_equilibrium import check_sessions
 from thermostand.experiments.steps import Role
 from thermostand.foundation.documents import parse_document, yaml_data
@@ -139,8 +139,8 @@ def session_target(session: Session) -> Target:
 def session_noise(session: Session) -> Noise | None:
     """The camera's noise, from the first frames; None when they do not determine it."""
     try:
-        others = others_ns(session)
-        first = list(islice((each for each in session.frames() if each.time_ns not in others), _NOISE_FRAMES))
+        channel = channel_of(session)
+        first = list(islice((each for each in session.frames() if each.channel == channel), _NOISE_FRAMES))
     except SessionError:  # the search for the markers comes to the same frame, and reports where it is
         return None
     partial = [frame.windows for frame in first if frame.windows is not None]
@@ -223,7 +223,7 @@ def _continued(report: Report, done_before: float) -> Report:
 def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -> Observations:
     """first: the first frame with the target, whose size the others must have."""
     known = session.frames_table()
-    own = np.flatnonzero(~np.isin(known.time_ns, list(others_ns(session))))
+    own = np.array(own_frames(session), np.int64)
     camera_degC, step_id = known.camera_degC[own], known.step_id[own]
     reasons = _reasons(found, first, camera_degC, known.superseded[own], known.flags[own])
     purposes = [_purpose(role, degC) for role, degC in zip(known.role[own], known.chamber_degC[own], strict=True)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.reading.session import Session
 
@@ -18,13 +20,10 @@ def take(session: Session, name: str | None) -> None:
     session.camera = name
 
 
-def others_ns(session: Session) -> frozenset[int]:
-    """When the other cameras' frames were exposed; no two frames of a session have one instant."""
+def channel_of(session: Session) -> str:
+    """The channel of the camera's frames; "" when the session has none."""
     names = _names(session)
-    if len(names) < 2:
-        return frozenset()
-    own = f"{session.camera if session.camera in names else names[0]}.image"
-    return frozenset(time_ns for time_ns, meta in session.frame_metas if meta.channel != own)
+    return f"{session.camera if session.camera in names else names[0]}.image" if names else ""
 
 
 def serial_of(session: Session) -> str:
@@ -40,12 +39,19 @@ def name_of(session: Session, serial: str) -> str | None:
     return names[serials.index(serial)] if len(names) == len(serials) > 1 and serials.count(serial) == 1 else None
 
 
+def temperatures_at_frames(session: Session) -> dict[int, float]:
+    """The camera's own temperature (degC, NaN: unknown) at the instants of its frames, and the others' at theirs."""
+    metas, own = session.frame_metas(), channel_of(session)
+    return {meta.time_ns: meta.camera_degC for meta in sorted(metas, key=lambda meta: meta.channel == own)}
+
+
 def own_frames(session: Session) -> list[int]:
     """The numbers of the camera's frames among all of the session."""
-    others = others_ns(session)
-    return [number for number, time_ns in enumerate(session.frame_times_ns.tolist()) if time_ns not in others]
+    own = channel_of(session)
+    return [number for number, meta in enumerate(session.frame_metas()) if meta.channel == own]
 
 
 def _names(session: Session) -> tuple[str, ...]:
-    channels = dict.fromkeys(meta.channel for _, meta in session.frame_metas)
+    """In the order of the recording."""
+    channels = dict.fromkeys(meta.channel for meta in sorted(session.frame_metas(), key=attrgetter("published_ns")))
     return tuple(channel.removesuffix(".image") for channel in channels)

@@ -55,8 +55,8 @@ def _settled_frames_ns(session: Session) -> list[int]:
     roles = {mark.step_id: mark.parameters.get("role") for mark in session.steps() if "role" in mark.parameters}
     begins_ns = begins_of(session.events())
     return [
-        time_ns
-        for time_ns, meta in session.frame_metas
+        meta.time_ns
+        for meta in session.frame_metas()
         if roles.get(meta.step_id, "warm_up") not in _TRANSIENT_ROLES
-        and not is_superseded(time_ns, meta.step_id, begins_ns)
+        and not is_superseded(meta.time_ns, meta.step_id, begins_ns)
     ]

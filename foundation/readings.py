@@ -70,7 +70,8 @@ class Frame:
     camera's own time stamp, ns. dropped: frames lost since the previous one. step_id: the plan's step that asked
     for it, "" when none did. windows: x, y, width, height of the parts of the image that were recorded, px, shape
     (n, 4), the rest is filled; None when the whole image is there. flags: why it is to be left out of fits, in words of
-    letters and _, such as TEMPERATURE_IN_DOUBT.
+    letters and _, such as TEMPERATURE_IN_DOUBT. significant_bits: of a sample, 0 for all of its type.
+    described: of a recorded frame, its description as it was recorded, with what was known when it was published.
     """
 
     channel: str
@@ -85,3 +86,5 @@ class Frame:
     step_id: str = ""
     windows: NDArray[np.int32] | None = None
     flags: tuple[str, ...] = ()
+    significant_bits: int = 0
+    described: bytes = b""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.budget.session_temperatures import CaptureState, capture_states
-from thermostand.compensation.one_camera import others_ns
+from thermostand.compensation.one_camera import channel_of
 from thermostand.foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE
 from thermostand.foundation.items import Event
 from thermostand.markers.detection import Detection, DetectionError, detect
@@ -72,9 +72,9 @@ def _mean_centres(session: Session, target: Target, wanted: set[str]) -> dict[st
     """Step -> mean centres (N, 2) of its frames, NaN for markers that one of them lacks."""
     seen: dict[str, list[NDArray[np.float64]]] = {}
     previous: Detection | None = None
-    others = others_ns(session)
+    own = channel_of(session)
     for frame in session.frames():
-        if frame.step_id not in wanted or frame.time_ns in others:
+        if frame.step_id not in wanted or frame.channel != own:
             continue
         try:
             previous = detect(frame.image, target, previous)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from thermostand.compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.visits import AXES, place, visits_for
-from thermostand.compensation.one_camera import others_ns
+from thermostand.compensation.one_camera import channel_of
 from thermostand.foundation.errors import CalibrationError, SessionError
 from thermostand.foundation.progress import Report
 from thermostand.markers.detection import Detection, DetectionError, detect
@@ -118,10 +118,9 @@ def _detect_all(
     previous: Detection | None = None
     size: tuple[int, int] | None = None
     refused = ""
-    others = others_ns(session)
+    own = channel_of(session)
     for number, image in enumerate(session.images(), 1):
-        is_own = image.meta is not None and image.time_ns not in others
-        detections = wanted.get(image.meta.step_id) if image.meta is not None and is_own else None
+        detections = wanted.get(image.meta.step_id) if image.meta.channel == own else None
         if report is not None:
             report(number, f"frame {number} of {session.frame_count}")
         if detections is None:

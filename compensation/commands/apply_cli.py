@@ -31,7 +31,7 @@ from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.history.states import States
 from thermostand.compensation.history.thermal_history import recorded_history, states_at
-from thermostand.compensation.one_camera import name_of, own_frames, take
+from thermostand.compensation.one_camera import name_of, own_frames, take, temperatures_at_frames
 from thermostand.experiments.steps import Role
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
@@ -230,7 +230,7 @@ def _without_history(model: DriftModel) -> DriftModel:
 def _recorded_states(model: DriftModel, session: Session, time_ns: Sequence[int]) -> States:
     """The thermal state at each instant, of which the same may come many times and in any order."""
     say(f"corrected with the {model.form} form of the model ({model.title}), by what {session.path.name} recorded")
-    recorded_degC = {frame_ns: meta.camera_degC for frame_ns, meta in session.frame_metas}
+    recorded_degC = temperatures_at_frames(session)
     instants, where = np.unique(np.array(time_ns, np.int64), return_inverse=True)
     camera_degC = np.array([recorded_degC.get(instant, math.nan) for instant in instants.tolist()])
     return states_at(recorded_history(session), model.memory, instants, camera_degC).where(where)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermostand.compensation.history.states import Float, Memory, States
 from thermostand.compensation.history.thermal_history import History, recorded_history, refined, states_at
+from thermostand.compensation.one_camera import temperatures_at_frames
 from thermostand.compensation.sound_values import check_degC
 from thermostand.recording.reading.session import Session
 
@@ -53,7 +54,7 @@ def states(
         return states_at(history_of(air, supply, camera, instants, own), model.memory, instants, own)
     if air is not None or supply is not None or camera is not None:
         raise ValueError("air, supply and camera belong to arrays; a session has recorded them")
-    recorded_degC = {frame_ns: meta.camera_degC for frame_ns, meta in session.frame_metas}
+    recorded_degC = temperatures_at_frames(session)
     wanted = session.frame_times_ns if time_ns is None else time_ns
     instants, own = _instants(wanted, camera_degC)
     if camera_degC is None:

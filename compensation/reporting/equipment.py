@@ -55,7 +55,7 @@ def _identity(data: dict[str, Any]) -> str:
 
 
 def _exposure(session: Session) -> Iterator[Line]:
-    metas = [meta for _, meta in session.frame_metas]
+    metas = session.frame_metas()
     if not metas:
         return
     exposures = sorted({meta.exposure_s for meta in metas if meta.exposure_s > 0})

@@ -32,6 +32,11 @@ def frame_bytes(pixel_format: PixelFormat, count: int) -> int:
     return -(-count * BITS_PER_PIXEL[pixel_format] // 8)
 
 
+def significant_bits(pixel_format: PixelFormat) -> int:
+    """Of a sample."""
+    return int(pixel_format.removeprefix("Mono").removesuffix("Packed").removesuffix("p"))
+
+
 class TemperatureFeature(Document):
     """Where the camera shows its temperature: a float feature (after `selector` is set to `entry`; null for a camera
     that has no selector), or a 32-bit register holding (value & mask) * scale + offset in degC. Outside

@@ -24,19 +24,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from google.protobuf.message import DecodeError
-
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import new_folder
 from thermostand.recording.exporting.frames_file import frames_rows
 from thermostand.recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
 from thermostand.recording.exporting.tables import TABLES, Cell, Column, CsvTable, TableFormat, check_format
 from thermostand.recording.exporting.telemetry_tables import TIME_COLUMNS, write_telemetry
-from thermostand.recording.format.damage import FileDamaged, naming
-from thermostand.recording.format.images import SIGNATURE, decode_image, encode_png
+from thermostand.recording.format.decoded_items import frame_of
+from thermostand.recording.format.images import encode_png
 from thermostand.recording.reading.notes import read_notes
-from thermostand.recording.reading.session import RecordedImage, Session
+from thermostand.recording.reading.session import Session
 
 STEP_COLUMNS = (
     *TIME_COLUMNS,
@@ -174,11 +171,11 @@ def _write_frames(session: Session, folder: Path, work: _Work) -> None:
     with closing(CsvTable(folder / "index.csv", (*SIDECAR_COLUMNS, *stand.columns))) as index:
         for number, image in enumerate(session.images(), 1):
             name = f"{number:06d}"
-            facts = (*frame_facts(f"{name}.png", image, session.utc), *stand.at(image.time_ns))
-            (folder / f"{name}.png").write_bytes(_png(image))
+            facts = (*frame_facts(f"{name}.png", image.meta, session.utc), *stand.at(image.time_ns))
+            (folder / f"{name}.png").write_bytes(encode_png(frame_of(image).image))
             (folder / f"{name}.txt").write_text(sidecar_text(stand.columns, facts), encoding="utf-8")
             index.add(facts)
-            work.done(len(image.data), f"frame {number} of {session.frame_count}")
+            work.done(image.stored_bytes, f"frame {number} of {session.frame_count}")
 
 
 def _write_frames_table(session: Session, folder: Path, has_images: bool, table_format: TableFormat) -> None:
@@ -194,17 +191,3 @@ def _write_originals(session: Session, folder: Path) -> None:
         folder.mkdir(exist_ok=True)
         plain = "".join(each if each.isalnum() or each in "._-" else "_" for each in original.name)
         (folder / f"{number:04d}-{plain[-100:]}").write_bytes(original.data)
-
-
-def _png(image: RecordedImage) -> bytes:
-    """The image as a PNG file: the recorded bytes when they are one."""
-    if image.schema == CompressedImage.DESCRIPTOR.full_name:
-        try:
-            data = CompressedImage.FromString(image.data).data
-        except DecodeError as error:
-            raise FileDamaged(f"{image.path}: an image message cannot be read ({error})") from error
-        if data.startswith(SIGNATURE):
-            return data
-    with naming(image.path):
-        decoded = decode_image(image.schema, image.data)
-    return encode_png(decoded.pixels, decoded.windows)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from operator import attrgetter
 from pathlib import Path
 
-from google.protobuf.message import Message as ProtobufMessage
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
@@ -16,15 +15,15 @@ from mcap_protobuf.schema import register_schema
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import make_durable_folder, sync_folder
 from thermostand.recording.exporting.topics import recorded_topics
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
-from thermostand.recording.format.layout import DEVICES, SESSION_METADATA
+from thermostand.recording.format.images import frame_topics
+from thermostand.recording.format.layout import DEVICES, SEQUENCE_MASK, SESSION_METADATA
 from thermostand.recording.format.records import Message, telemetry_messages
 from thermostand.recording.reading.notes import NOTES_NAME
 from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.forms import frames_topic
 from thermostand.recording.writing.segment import Topic
 
 _CHUNK_BYTES = 1 << 22
-_CLASSES: dict[str, type[ProtobufMessage]] = {each.DESCRIPTOR.full_name: each for each in IMAGE_CLASS.values()}
 
 
 def export_mcap(
@@ -35,8 +34,7 @@ def export_mcap(
     telemetry: bool = True,
     report: Callable[[float, str], None],
 ) -> None:
-    """Write `session` as the file `out`, which must not exist; memory stays flat. Images are stored as they are;
-    without images everything is compressed.
+    """Write `session` as the file `out`, which must not exist; memory stays flat. Everything is compressed.
 
     `report` gets the share of the messages that is done (0 to 1). SessionError when the session cannot be read or `out`
     not be written; `out` then does not appear.
@@ -47,8 +45,7 @@ def export_mcap(
     try:
         make_durable_folder(out.parent)
         with part.open("wb") as file:
-            compression = CompressionType.NONE if frames and session.frame_count else CompressionType.ZSTD
-            writer = Writer(file, _CHUNK_BYTES, compression)
+            writer = Writer(file, _CHUNK_BYTES, CompressionType.ZSTD)
             _write(session, writer, _messages(session, frames, telemetry), report)
             file.flush()
             os.fsync(file.fileno())
@@ -63,7 +60,7 @@ def export_mcap(
 def _write(
     session: Session,
     writer: Writer,
-    found: Iterator[tuple[str, Message]],
+    found: Iterator[Message],
     report: Callable[[float, str], None],
 ) -> None:
     writer.start(library="thermostand")
@@ -74,14 +71,14 @@ def _write(
         writer.add_attachment(0, 0, NOTES_NAME, "application/jsonl", notes.read_bytes())
     writer.add_metadata(SESSION_METADATA, session.metadata)
     topics = {topic.name: topic for topic in recorded_topics(session)}
-    channels: dict[tuple[str, str], int] = {}
+    channels: dict[str, int] = {}
     times = session.frame_times_ns
     begin_ns, end_ns = (int(times[0]), int(times[-1])) if len(times) else (0, 0)
-    for schema, message in found:
-        key = (message.topic, schema)
-        if key not in channels:
-            channels[key] = _channel(writer, topics.get(message.topic) or Topic(message.topic, _CLASSES[schema]))
-        writer.add_message(channels[key], message.time_ns, message.data, message.time_ns, message.sequence)
+    for message in found:
+        topic = message.topic
+        if topic not in channels:
+            channels[topic] = _channel(writer, topics.get(topic) or frames_topic(topic))
+        writer.add_message(channels[topic], message.time_ns, message.data, message.time_ns, message.sequence)
         if end_ns > begin_ns:
             report(min(1.0, max(0.0, (message.time_ns - begin_ns) / (end_ns - begin_ns))), "messages")
     writer.finish()
@@ -94,18 +91,20 @@ def _channel(writer: Writer, topic: Topic) -> int:
     )
 
 
-def _messages(session: Session, frames: bool, telemetry: bool) -> Iterator[tuple[str, Message]]:
-    """(schema of an image, "" for others; message), in order of time as far as each series is."""
-    of_telemetry = (("", each) for each in _telemetry(session)) if telemetry else iter(())
-    of_frames = (
-        ((image.schema, Message(CAMERA_IMAGE, image.sequence, image.time_ns, image.data)) for image in session.images())
-        if frames
-        else iter(())
-    )
-    by_time = attrgetter("time_ns")
-    return heapq.merge(of_telemetry, of_frames, key=lambda each: by_time(each[1]))
+def _messages(session: Session, frames: bool, telemetry: bool) -> Iterator[Message]:
+    """In order of time as far as each series is."""
+    of_telemetry = _telemetry(session) if telemetry else iter(())
+    of_frames = _frames(session) if frames else iter(())
+    return heapq.merge(of_telemetry, of_frames, key=attrgetter("time_ns"))
 
 
 def _telemetry(session: Session) -> Iterator[Message]:
     for path in session.telemetry_segments:
         yield from telemetry_messages(path, lambda channel: True)
+
+
+def _frames(session: Session) -> Iterator[Message]:
+    for image in session.images():
+        topics, sequence = frame_topics(image.meta.channel), image.meta.block_id & SEQUENCE_MASK
+        yield Message(topics.meta, sequence, image.time_ns, image.description)
+        yield Message(topics.image, sequence, image.time_ns, bytes(image.data))

@@ -23,10 +23,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
 from thermostand.recording.exporting.topics import recorded_devices
-from thermostand.recording.format.decoded_items import Description
 from thermostand.recording.format.holes import holes_text
-from thermostand.recording.format.images import IMAGE_CLASS, ImageEncoding
-from thermostand.recording.format.records import frame_places
 from thermostand.recording.reading.journal_lines import JOURNAL_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
@@ -66,37 +63,28 @@ class ReplayClock:
         return self._wall.hold()
 
 
-def _nobody(_: Description) -> None:
-    """Descriptions whose image is missing are nothing that a stand publishes."""
+async def replay(session: Session, hub: Hub, clock: Clock) -> None:
+    """Publish every item of the session on `hub`, each when `clock` has reached the instant of its publication.
 
-
-async def replay(session: Session, hub: Hub, clock: Clock, describe: Callable[[Description], None] = _nobody) -> None:
-    """Publish every item of the session on `hub`, each when `clock` has reached its time. `describe` gets the
-    descriptions whose images are missing, in their turn.
-
-    The order is that of the recording. A frame was published after the middle of its exposure, which is its time; such
-    an item comes at once, because the clock has passed it. Reading and decoding hold the clock, off the loop. Raises
-    SessionError at the first item that cannot be read.
+    The order is that of the recording. Reading and decoding hold the clock, off the loop. Raises SessionError at the
+    first item that cannot be read.
     """
-    items = session.items_and_descriptions()
+    items = session.published()
     lane = Lane("replay", clock)
     try:
         while portion := await lane.call(_portion, items):
-            for item in portion:
-                await clock.sleep_until(item.time_ns)
-                if isinstance(item, Description):
-                    describe(item)
-                else:
-                    hub.publish(item)
+            for time_ns, item in portion:
+                await clock.sleep_until(time_ns)
+                hub.publish(item)
     finally:
         lane.close()
 
 
-def _portion(items: Iterator[Item | Description]) -> list[Item | Description]:
+def _portion(items: Iterator[tuple[int, Item]]) -> list[tuple[int, Item]]:
     """The next items, up to and with a frame; none at the end."""
-    portion: list[Item | Description] = []
-    for item in items:
-        portion.append(item)
+    portion: list[tuple[int, Item]] = []
+    for time_ns, item in items:
+        portion.append((time_ns, item))
         if isinstance(item, Frame) or len(portion) >= PORTION_ITEMS:
             break
     return portion
@@ -108,18 +96,18 @@ async def replay_and_record(
     """Replay `session` and record it again as the session `out`, which must not exist; returns `out`.
 
     speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
-    has the same metadata (the session's id, too), attachments, devices, items and journal: nothing in it mentions
-    the replay, because it is the same session in other segments. What the original lacks is listed in its
-    metadata, and an image or a description that lacks the other goes into the copy as it is. SessionError when it has
-    no items, or cannot be read or written whole, as on a disk that is slower than `speed`; `out` then does not appear.
+    has the same metadata (the session's id, too), attachments, devices, items and journal: nothing in it mentions the
+    replay, because it is the same session in other segments. What the original lacks is listed in its metadata.
+    SessionError when it has no items, or cannot be read or written whole, as on a disk that is slower than `speed`;
+    `out` then does not appear.
     """
-    first = next(session.items(), None)
-    if first is None:
+    first_ns = next((time_ns for time_ns, _ in session.published()), None)
+    if first_ns is None:
         raise SessionError(f"{session.path}: holds nothing that could be replayed")
-    clock = VirtualClock(first.time_ns) if speed is None else ReplayClock(first.time_ns, speed)
+    clock = VirtualClock(first_ns) if speed is None else ReplayClock(first_ns, speed)
     hub = Hub()
     watch(hub)
-    settings = _settings(session, VIRTUAL_COMMIT_S if speed is None else speed)
+    settings = _settings(VIRTUAL_COMMIT_S if speed is None else speed)
     info = SessionInfo.of(session.metadata)
     if session.holes:
         info = replace(info, holes=holes_text(session.holes))
@@ -129,7 +117,7 @@ async def replay_and_record(
         recorder.start()
         background = [recorder.run()] + ([clock.run()] if isinstance(clock, VirtualClock) else [])
         try:
-            await _beside(replay(session, hub, clock, recorder.keep_description), background)
+            await _beside(replay(session, hub, clock), background)
         finally:
             await recorder.finish()
         _copy_journal(session, folder)
@@ -160,15 +148,6 @@ def _copy_journal(session: Session, folder: Path) -> None:
         shutil.copyfile(journal, folder / JOURNAL_NAME)
 
 
-def _settings(session: Session, commit_s: float) -> RecordingSettings:
+def _settings(commit_s: float) -> RecordingSettings:
     """Without the rules of a stand for a nearly full disk: a copy may fill it, and says nothing of it."""
-    return RecordingSettings(
-        _encoding(session), telemetry_commit_s=commit_s, stop_frames_below_bytes=0, alert_below_fraction=0.0
-    )
-
-
-def _encoding(session: Session) -> ImageEncoding:
-    """Raw when all frames were; a PNG takes every other, also one of which only windows are real."""
-    raw = IMAGE_CLASS["raw"].DESCRIPTOR.full_name
-    schemas = {place.schema for path in session.frame_segments for place in frame_places(path)}
-    return "raw" if schemas == {raw} else "png"
+    return RecordingSettings(telemetry_commit_s=commit_s, stop_frames_below_bytes=0, alert_below_fraction=0.0)

@@ -12,8 +12,9 @@ from thermostand.foundation.instants import utc_text
 from thermostand.recording.exporting.tables import Cell, Column
 from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.format import messages
+from thermostand.recording.format.images import windows_of
 from thermostand.recording.format.utc_offsets import UtcOffsets
-from thermostand.recording.reading.session import RecordedImage, Session
+from thermostand.recording.reading.session import Session
 
 SIDECAR_COLUMNS = (
     Column("file", "text"),
@@ -28,19 +29,18 @@ SIDECAR_COLUMNS = (
     Column("dropped", "count"),
     Column("step_id", "word"),
     Column("flags", "word"),
+    Column("significant_bits", "count"),
+    Column("windows_px", "text"),
 )
 
 
-def frame_facts(file: str, image: RecordedImage, utc: UtcOffsets) -> tuple[Cell, ...]:
-    """The cells of SIDECAR_COLUMNS. Of a frame whose description is lost, numbers that are not known are NaN and the
-    rest is empty; its block id is then the 32 bits that were recorded with the image."""
-    time_ns, utc_ns, meta = image.time_ns, utc.utc_ns(image.time_ns), image.meta
-    if meta is None:
-        return (file, utc_ns, time_ns, math.nan, math.nan, math.nan, None, image.sequence, None, None, None, None)
+def frame_facts(file: str, meta: messages.FrameMeta, utc: UtcOffsets) -> tuple[Cell, ...]:
+    """The cells of SIDECAR_COLUMNS. windows_px: `x,y,width,height;...` of a frame of which only these are real."""
+    windows = windows_of(meta)
     return (
         file,
-        utc_ns,
-        time_ns,
+        utc.utc_ns(meta.time_ns),
+        meta.time_ns,
         meta.camera_degC,
         meta.exposure_s,
         meta.gain_dB,
@@ -50,6 +50,8 @@ def frame_facts(file: str, image: RecordedImage, utc: UtcOffsets) -> tuple[Cell,
         meta.dropped,
         meta.step_id,
         ",".join(meta.flags),
+        meta.significant_bits,
+        "" if windows is None else ";".join(",".join(map(str, window)) for window in windows.tolist()),
     )
 
 

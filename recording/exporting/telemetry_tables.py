@@ -42,13 +42,14 @@ Quantities = Mapping[str, Sequence[Quantity]]  # by topic
 def write_telemetry(
     session: Session, folder: Path, table_format: TableFormat, done: Callable[[int, str], None]
 ) -> None:
-    """One table per topic, in the order of the recording. `done` gets the bytes of each segment that has been read."""
+    """One table per topic, in the order of the recording, and one of the frames' descriptions. `done` gets the bytes of
+    each segment that has been read."""
     folder.mkdir()
     quantities = _quantities(session)
     tables: dict[str, Table] = {}
     with ExitStack() as stack:
         for path in session.telemetry_segments:
-            for message in telemetry_messages(path, lambda channel: _has_table(channel.topic)):
+            for message in telemetry_messages(path, lambda channel: channel.topic in messages.KIND_OF_TOPIC):
                 if message.topic not in tables:
                     name = message.topic.strip("/").replace("/", "_")
                     columns = _columns(message.topic, quantities)
@@ -58,10 +59,27 @@ def write_telemetry(
                 for row in _rows(message, quantities, session.utc):
                     tables[message.topic].add(row)
             done(path.stat().st_size, f"telemetry {path.name}")
+        if metas := session.frame_metas():
+            described = TABLES[table_format](folder / f"camera_meta.{table_format}", META_COLUMNS)
+            stack.callback(described.close)
+            for meta in metas:
+                described.add(_described(meta, session.utc))
 
 
-def _has_table(topic: str) -> bool:
-    return topic == messages.CAMERA_META or topic in messages.KIND_OF_TOPIC
+def _described(meta: messages.FrameMeta, utc: UtcOffsets) -> Sequence[Cell]:
+    return (
+        meta.time_ns,
+        utc.utc_ns(meta.time_ns),
+        meta.channel,
+        meta.step_id,
+        meta.block_id,
+        meta.camera_ticks,
+        meta.exposure_s,
+        meta.gain_dB,
+        meta.camera_degC,
+        meta.dropped,
+        ",".join(meta.flags),
+    )
 
 
 def _quantities(session: Session) -> Quantities:
@@ -90,8 +108,6 @@ def _taken(quantities: Sequence[Quantity]) -> set[str]:
 
 def _columns(topic: str, quantities: Quantities) -> tuple[Column, ...]:
     """time_ns is the instant of the measurement; a value's unit is in its name."""
-    if topic == messages.CAMERA_META:
-        return META_COLUMNS
     values = [
         column
         for quantity in quantities[topic]
@@ -101,24 +117,8 @@ def _columns(topic: str, quantities: Quantities) -> tuple[Column, ...]:
 
 
 def _rows(message: Message, quantities: Quantities, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
-    if message.topic == messages.CAMERA_META:
-        meta = messages.decode_frame_meta(message.data)
-        yield (
-            message.time_ns,
-            utc.utc_ns(message.time_ns),
-            meta.channel,
-            meta.step_id,
-            meta.block_id,
-            meta.camera_ticks,
-            meta.exposure_s,
-            meta.gain_dB,
-            meta.camera_degC,
-            meta.dropped,
-            ",".join(meta.flags),
-        )
-    else:
-        batch = messages.decode_batch(message.topic, message.data, message.time_ns)
-        yield from _batch_rows(quantities[message.topic], batch, utc)
+    batch = messages.decode_batch(message.topic, message.data, message.time_ns)
+    yield from _batch_rows(quantities[message.topic], batch, utc)
 
 
 def _batch_rows(quantities: Sequence[Quantity], batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:

@@ -8,8 +8,7 @@ of the stand's clock to UTC when there was one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import chain, groupby
-from operator import attrgetter
+from itertools import chain
 from pathlib import Path
 
 from mcap.writer import CompressionType
@@ -22,12 +21,13 @@ from thermostand.foundation.items import StepMark, StepState
 from thermostand.recording.exporting.topics import recorded_topics
 from thermostand.recording.format import messages
 from thermostand.recording.format.holes import holes_text
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
 from thermostand.recording.format.utc_offsets import offset_event
 from thermostand.recording.reading.extent import Extent, extent_of
 from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.forms import frames_topic
 from thermostand.recording.writing.recorder import RecordingSettings
 from thermostand.recording.writing.segment import Record, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
@@ -155,25 +155,36 @@ def _blocks(records: Iterator[Record]) -> Iterator[list[Record]]:
 
 
 def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, places: list[FramePlace]) -> None:
-    """One frame per commit, as a chunk holds one; a segment has one kind of image."""
-    folder.mkdir()
-    classes = {message.DESCRIPTOR.full_name: message for message in IMAGE_CLASS.values()}
-    for schema, alike in groupby(places, key=attrgetter("schema")):
-        series = _series(session, metadata, folder, (Topic(CAMERA_IMAGE, classes[schema]),), CompressionType.NONE)
-        for place in alike:
-            message = read_frame(place)
-            record = Record(CAMERA_IMAGE, message.time_ns, message.data, message.sequence)
-            _commit(series, [record], place.time_ns)
-        _finish(series)
+    """One frame per commit, as a chunk holds one."""
+    if not places:
+        return
+    channels = dict.fromkeys(place.meta.channel for place in places)
+    topics = tuple(frames_topic(name) for channel in channels for name in frame_topics(channel))
+    series = _series(session, metadata, folder, topics, CompressionType.ZSTD, ZSTD_LEVEL)
+    for place in places:
+        names, stored, meta = frame_topics(place.meta.channel), read_frame(place), place.meta
+        stamps = place.sequence, meta.published_ns
+        records = [
+            Record(names.meta, meta.time_ns, stored.meta, *stamps),
+            Record(names.image, meta.time_ns, stored.image, *stamps),
+        ]
+        _commit(series, records, place.time_ns)
+    _finish(series)
 
 
 def _series(
-    session: Session, metadata: Mapping[str, str], folder: Path, topics: tuple[Topic, ...], compression: CompressionType
+    session: Session,
+    metadata: Mapping[str, str],
+    folder: Path,
+    topics: tuple[Topic, ...],
+    compression: CompressionType,
+    level: int = 3,
 ) -> Series:
     folder.mkdir(exist_ok=True)
     usual = RecordingSettings()
     segment_ns = seconds_ns(usual.segment_s)
-    form = SeriesForm(folder.name, topics, compression, metadata, session.attachments, usual.segment_bytes, segment_ns)
+    texts, size_bytes = session.attachments, usual.segment_bytes
+    form = SeriesForm(folder.name, topics, compression, metadata, texts, size_bytes, segment_ns, level=level)
     return Series(folder, form)
 
 

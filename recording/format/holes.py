@@ -10,7 +10,7 @@ from typing import cast
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.utc_offsets import UtcOffsets
 
-_WHAT = {TELEMETRY: "without their descriptions", FRAMES: "that are described"}
+_WHAT = {TELEMETRY: "", FRAMES: "of steps that are done"}
 _NUMBERS = (int, type(None))
 
 
@@ -20,9 +20,8 @@ class Hole:
 
     first, last: numbers of the segments that are missing; both None when only frames, or their descriptions, are, and
     last alone when their number is unknown. begin_ns, end_ns: the recorded data end and begin again at these
-    instants, None at the begin and the end of the session. frames: how many lack their image (series `frames`) or
-    description (`telemetry`). excused: frames that were never acknowledged, or that the recorder itself said it lost:
-    such a stretch makes no session incomplete.
+    instants, None at the begin and the end of the session. frames: how many are not there. excused: frames that the
+    recorder itself said it lost: such a stretch makes no session incomplete.
     """
 
     series: str

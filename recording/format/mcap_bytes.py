@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import BinaryIO, NamedTuple
 
 import deflate
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.records import McapRecord
@@ -26,7 +27,6 @@ MESSAGE_INDEX = struct.Struct("<HI")  # channel id, length of the entries
 MESSAGE_INDEX_ENTRY = struct.Struct("<QQ")  # log time, place in the chunk
 
 CHUNK_LIMIT_BYTES = 1 << 28  # a chunk is 1 MiB or one image; one that claims more is damaged
-INFLATED_LIMIT_BYTES = 1 << 24  # only telemetry is compressed, and its chunks are 1 MiB and a message
 RECORD_LIMIT_BYTES = CHUNK_LIMIT_BYTES + 1024
 
 _NAME_BYTES = {b"": 0, b"zstd": 4}
@@ -113,7 +113,7 @@ def chunk_head(content: bytes | memoryview, length: int) -> ChunkHead:
     name = bytes(content[CHUNK.size : CHUNK.size + min(name_bytes, 16)])
     if _NAME_BYTES.get(name) != name_bytes:
         raise ValueError(f"a chunk is compressed with {name!r}")
-    if size_bytes > (INFLATED_LIMIT_BYTES if name else CHUNK_LIMIT_BYTES):
+    if size_bytes > CHUNK_LIMIT_BYTES:
         raise ValueError(f"a chunk claims {size_bytes} bytes")
     (data_bytes,) = LENGTH.unpack_from(content, CHUNK.size + name_bytes)
     begin = CHUNK.size + name_bytes + LENGTH.size
@@ -128,11 +128,21 @@ def chunk_content(content: memoryview) -> tuple[ChunkHead, memoryview]:
     head = chunk_head(content, len(content))
     data = content[head.begin :]
     if head.compression:
-        # As much memory is taken as the frame says: so both have to say the same.
-        if zstandard.frame_content_size(data) != head.size_bytes:
-            raise ValueError("a chunk's size is wrong")
-        data = memoryview(zstandard.decompress(data))
-        if len(data) != head.size_bytes:
-            raise ValueError("a chunk's size is wrong")
+        data = _inflated(data, head.size_bytes)
     check_crc(data, head.crc, "a chunk")
     return head, data
+
+
+def _inflated(data: memoryview, size_bytes: int) -> memoryview:
+    """What zstd has made of so many bytes, in memory that may be written to; ValueError when it is another number."""
+    # As much memory is taken as the chunk says: so both have to say the same.
+    if zstandard.frame_content_size(data) != size_bytes:
+        raise ValueError("a chunk's size is wrong")
+    room = np.empty(size_bytes, np.uint8).data  # not cleared first, as a bytearray would be
+    with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+        done = 0
+        while done < size_bytes and (read := stream.readinto(room[done:])):
+            done += read
+    if done != size_bytes:
+        raise ValueError("a chunk's size is wrong")
+    return room

@@ -1,4 +1,4 @@
-"""What a session holds, message by message: items of the hub to protobuf and back.
+"""What a session holds, message by message: items of the hub to protobuf and back, and what belongs to a frame.
 
 Own messages are in package `thermostand`, one file each, made here at run time (no protoc); where Foxglove has a
 schema its name is used. Every batch message has one double per quantity, its unit in the field's name, and a quality
@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from typing import Any, cast
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -34,10 +35,9 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, Original, StepMark, StepState
-from thermostand.foundation.readings import Cause, Frame, Quality, Reading
+from thermostand.foundation.readings import Cause, Quality, Reading
 from thermostand.recording.format.kinds import KIND_OF_TOPIC, KINDS, Kind
 
-CAMERA_META = "/camera/meta"
 TABLE_POSE = "/table/pose"
 STEP = "/experiment/step"
 EVENT = "/experiment/event"
@@ -45,6 +45,7 @@ LOG = "/log"
 ORIGINAL = "/imager/original"
 
 DOUBLE = FieldDescriptorProto.TYPE_DOUBLE
+BYTES = FieldDescriptorProto.TYPE_BYTES
 STRING = FieldDescriptorProto.TYPE_STRING
 INT32 = FieldDescriptorProto.TYPE_INT32
 UINT64 = FieldDescriptorProto.TYPE_UINT64
@@ -110,20 +111,49 @@ REMARK_CLASS = _message_class(
         _field("cause", 7, STRING),
     ],
 )
-_FrameMeta = _plain_class(
-    "FrameMeta",
-    {
-        "channel": STRING,
-        "step_id": STRING,
-        "block_id": UINT64,
-        "camera_ticks": UINT64,
-        "exposure_s": DOUBLE,
-        "gain_dB": DOUBLE,
-        "camera_degC": DOUBLE,
-        "dropped": UINT64,
-        "flags": STRING,  # with a comma between them
-    },
-)
+_FRAME_META: Mapping[str, FieldDescriptorProto.Type.ValueType] = {
+    "channel": STRING,
+    "time_ns": INSTANT,  # middle of the exposure
+    "published_ns": INSTANT,
+    "step_id": STRING,
+    "role": STRING,
+    "chamber_degC": DOUBLE,
+    "block_id": UINT64,
+    "camera_ticks": UINT64,
+    "exposure_s": DOUBLE,
+    "gain_dB": DOUBLE,
+    "camera_degC": DOUBLE,
+    "dropped": UINT64,
+    "flags": STRING,  # with a comma between them
+    "width": INT32,
+    "height": INT32,
+    "significant_bits": INT32,
+    "windows": BYTES,  # x, y, width, height of each, 32 bits, low byte first
+}
+
+
+def _frame_meta_class() -> type[Message]:
+    """The description of a frame, and with it the last reading of each temperature and position of the stand."""
+    readings = _field("readings", len(_FRAME_META) + 1, MESSAGE, ".thermostand.Reading")
+    readings.label = FieldDescriptorProto.LABEL_REPEATED
+    fields = [_field(name, number, kind) for number, (name, kind) in enumerate(_FRAME_META.items(), 1)]
+    return _message_class("FrameMeta", [*fields, readings], needs_reading=True)
+
+
+FRAME_META_CLASS = _frame_meta_class()
+
+
+def _frame_table_class() -> type[Message]:
+    file = FileDescriptorProto(name="thermostand/FrameTable.proto", package="thermostand", syntax="proto3")
+    file.dependency.append("thermostand/FrameMeta.proto")
+    frames = _field("frames", 1, MESSAGE, ".thermostand.FrameMeta")
+    frames.label = FieldDescriptorProto.LABEL_REPEATED
+    file.message_type.add(name="FrameTable", field=[frames])
+    _pool.Add(file)
+    return GetMessageClass(_pool.FindMessageTypeByName("thermostand.FrameTable"))
+
+
+_FrameTable = _frame_table_class()
 _Step = _plain_class(
     "Step", {"step_id": STRING, "index": INT32, "kind": STRING, "state": STRING, "parameters_json": STRING}
 )
@@ -132,7 +162,6 @@ _Event = _plain_class("Event", {"level": STRING, "kind": STRING, "text": STRING,
 # Topic of the telemetry series -> message class.
 CLASSES: Mapping[str, type[Message]] = {
     **{kind.topic: _batch_class(kind) for kind in KINDS.values()},
-    CAMERA_META: _FrameMeta,
     TABLE_POSE: PoseInFrame,
     STEP: _Step,
     EVENT: _Event,
@@ -183,34 +212,88 @@ def _reading(
         raise SessionError(f"{channel}: the recorded value {value} does not fit its quality {quality}") from error
 
 
-def encode_frame_meta(frame: Frame) -> bytes:
-    """What belongs to a frame, without its image."""
-    fields = {name: getattr(frame, name) for name in FrameMeta.__dataclass_fields__}
-    fields |= {"camera_degC": canonical(frame.camera_degC), "flags": ",".join(frame.flags)}
-    return _FrameMeta(**fields).SerializeToString()
-
-
 @dataclass(frozen=True, slots=True)
 class FrameMeta:
-    """A frame without its image; see foundation.readings.Frame."""
+    """A frame without its image: see foundation.readings.Frame. published_ns: when it was published. role,
+    chamber_degC: what for, and the set-point, as its step says; "" and NaN when no step does. width, height: px.
+    significant_bits: of a sample. windows: as in Frame, as bytes, b"" when all of the image is there."""
 
     channel: str
+    time_ns: int
+    published_ns: int
     step_id: str
+    role: str
+    chamber_degC: float
     block_id: int
     camera_ticks: int
     exposure_s: float
     gain_dB: float
     camera_degC: float
     dropped: int
-    flags: tuple[str, ...] = ()
+    flags: tuple[str, ...]
+    width: int
+    height: int
+    significant_bits: int
+    windows: bytes
+
+
+def encode_frame_meta(meta: FrameMeta, readings: Iterable[Reading] = ()) -> bytes:
+    """The description as a message, with what the stand read last before the frame was published."""
+    fields: dict[str, Any] = {name: getattr(meta, name) for name in _FRAME_META}
+    fields |= {name: canonical(fields[name]) for name in ("chamber_degC", "camera_degC", "exposure_s", "gain_dB")}
+    fields |= {"flags": ",".join(meta.flags), "readings": list(map(remark_of, readings))}
+    return FRAME_META_CLASS(**fields).SerializeToString()
 
 
 def decode_frame_meta(data: bytes) -> FrameMeta:
     """The inverse of encode_frame_meta; SessionError when it is not one."""
-    message = _parse(CAMERA_META, data)
-    fields: dict[str, Any] = {name: _get(message, name) for name in FrameMeta.__dataclass_fields__}
+    try:
+        return _frame_meta(FRAME_META_CLASS.FromString(data))
+    except DecodeError as error:
+        raise SessionError(f"a frame's description cannot be read ({error})") from error
+
+
+def _frame_meta(message: Message) -> FrameMeta:
+    fields: dict[str, Any] = {name: _get(message, name) for name in _FRAME_META}
     fields["flags"] = tuple(filter(None, fields["flags"].split(",")))
     return FrameMeta(**fields)
+
+
+def frame_table(descriptions: Iterable[bytes]) -> bytes:
+    """The descriptions of a segment's frames, in their order, as one message."""
+    parts = ((b"\x0a", varint(len(description)), description) for description in descriptions)
+    return b"".join(chain.from_iterable(parts))
+
+
+def decode_frame_table(data: bytes) -> list[FrameMeta]:
+    """The inverse; SessionError when it is none."""
+    try:
+        return list(map(_frame_meta, _get(_FrameTable.FromString(data), "frames")))
+    except DecodeError as error:
+        raise SessionError(f"the table of frames cannot be read ({error})") from error
+
+
+def varint(number: int) -> bytes:
+    """Protobuf's encoding of a length: seven bits a byte, the lowest first, the top bit set on all but the last."""
+    encoded = bytearray()
+    while number > 0x7F:
+        encoded.append(number & 0x7F | 0x80)
+        number >>= 7
+    encoded.append(number)
+    return bytes(encoded)
+
+
+def remark_of(reading: Reading) -> Message:
+    """A reading in full."""
+    return REMARK_CLASS(
+        channel=reading.channel,
+        value=canonical(reading.value),
+        unit=reading.unit,
+        time_ns=reading.time_ns,
+        quality=QUALITY_NUMBER[reading.quality],
+        reason=reading.reason,
+        cause=reading.cause,
+    )
 
 
 def encode_step(mark: StepMark) -> bytes:

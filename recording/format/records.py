@@ -13,35 +13,39 @@ from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.format.damage import FileDamaged, reading
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
-from thermostand.recording.format.layout import SALVAGE_METADATA, SEGMENT_METADATA, SESSION_METADATA, contradicts
+from thermostand.recording.format.damage import FileDamaged, naming, reading
+from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA
+from thermostand.recording.format.layout import (
+    FRAME_TABLE,
+    SALVAGE_METADATA,
+    SEGMENT_METADATA,
+    SEQUENCE_MASK,
+    SESSION_METADATA,
+    contradicts,
+)
 from thermostand.recording.format.mcap_bytes import (
     CHUNK_LIMIT_BYTES,
+    MESSAGE,
     RECORD,
     ChunkHead,
     check_attachment,
-    check_crc,
     chunk_content,
     chunk_head,
+    records,
     stream,
 )
-from thermostand.recording.format.messages import CLASSES
+from thermostand.recording.format.messages import CLASSES, FrameMeta, decode_frame_meta, decode_frame_table
 from thermostand.recording.format.summary import ChunkPlace, Summary, read_summary
 
 _CHUNK_HEAD_BYTES = 64
-_FRAME_HEAD_BYTES = 1 << 14  # schema, channel and what precedes the image; 3 KiB in the first chunk, 90 bytes in others
-SCHEMAS = {
-    CAMERA_IMAGE: {image.DESCRIPTOR.full_name for image in IMAGE_CLASS.values()},
-    **{topic: {message.DESCRIPTOR.full_name} for topic, message in CLASSES.items()},
-}
+SCHEMAS = {topic: {message.DESCRIPTOR.full_name} for topic, message in CLASSES.items()}
 
 _MESSAGE_START = struct.Struct("<BQH")  # opcode, length, channel id
 _MESSAGE_REST = struct.Struct("<Iqq")  # sequence, log time, publish time; signed, as every instant of ours
@@ -73,17 +77,21 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class FramePlace:
-    """Where a frame is: its segment, its chunk there, and number and schema of its channel."""
+    """A frame by its identity: its segment, its chunk there, and its description."""
 
     path: Path
     chunk: ChunkPlace
-    channel: int
-    schema: str
+    meta: FrameMeta
 
     @property
     def time_ns(self) -> int:
         """Middle of the frame's exposure."""
-        return self.chunk.first_ns
+        return self.meta.time_ns
+
+    @property
+    def sequence(self) -> int:
+        """The low 32 bits of its block id, as its messages have them."""
+        return self.meta.block_id & SEQUENCE_MASK
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +108,7 @@ def read_head(path: Path) -> Head:
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
         head = _head(path, file)
-        if len(head.attachments) != summary.statistics.attachment_count:
+        if len(head.attachments) != summary.statistics.attachment_count - (FRAME_TABLE in summary.attachments()):
             raise ValueError("its attachments are not those that its index lists")
         return head
 
@@ -235,62 +243,86 @@ def message_span(path: Path) -> MessageSpan:
 
 
 def frame_places(path: Path) -> list[FramePlace]:
-    """The frames of a segment, from its index alone."""
+    """The frames of a segment in the order of the file, from its table of them; no image is decompressed unless
+    another program has written the file without one."""
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
+        chunks = list(summary.chunks())
+        table = summary.attachments().get(FRAME_TABLE)
+        with naming(path):
+            if table is None:
+                metas = [decode_frame_meta(bytes(frame_messages(_chunk(file, chunk))[0].data)) for chunk in chunks]
+            else:
+                metas = decode_frame_table(_attachment(file, *table).data)
+        if len(metas) != len(chunks) or summary.statistics.message_count != 2 * len(chunks):
+            raise ValueError("its chunks are not one frame each, or its table does not list them")
         channels = _channels(summary)
-        places: list[FramePlace] = []
-        for chunk in summary.chunks():
-            (number,) = chunk.channels
-            places.append(FramePlace(path, chunk, number, channels[number][1]))
-        if summary.statistics.message_count != len(places):
-            raise ValueError("its chunks are not one frame each")
+        if any([channels[number][1] for number in chunk.channels] != [META_SCHEMA, IMAGE_SCHEMA] for chunk in chunks):
+            raise ValueError("its chunks are not of a description and an image")
+        places = [FramePlace(path, chunk, meta) for chunk, meta in zip(chunks, metas, strict=True)]
+        if any((place.time_ns,) * 2 != (place.chunk.first_ns, place.chunk.last_ns) for place in places):
+            raise ValueError("its table lists other frames")
         return places
+
+
+def _attachment(file: BinaryIO, offset: int, length: int) -> Attachment:
+    data = _read(file, offset, length)
+    if RECORD.unpack_from(data) != (Opcode.ATTACHMENT, length - RECORD.size):
+        raise ValueError("the index does not point to an attachment")
+    check_attachment(data[RECORD.size :])
+    return Attachment.read(stream(data[RECORD.size :]))
 
 
 def frame_crcs(path: Path, places: Sequence[FramePlace]) -> list[int]:
     """The CRCs that frames of one segment are said to have, by the heads of their chunks; no frame is read."""
     with reading(path), path.open("rb", buffering=0) as file:
-        return [_frame_chunk(file, place.chunk, _CHUNK_HEAD_BYTES)[1].crc for place in places]
+        return [_frame_head(file, place.chunk).crc for place in places]
 
 
-def _frame_chunk(file: BinaryIO, chunk: ChunkPlace, size: int) -> tuple[bytes, ChunkHead]:
-    """The first bytes of a frame's chunk, and its head."""
-    data = _read(file, chunk.offset, min(chunk.length, size))
+def _frame_head(file: BinaryIO, chunk: ChunkPlace) -> ChunkHead:
+    data = _read(file, chunk.offset, min(chunk.length, _CHUNK_HEAD_BYTES))
     _check_place(data, chunk)
     head = chunk_head(memoryview(data)[RECORD.size :], chunk.length - RECORD.size)
     _check_times(head, chunk)
-    if head.compression:
-        raise ValueError("a frame's chunk is compressed")
-    return data, head
+    return head
 
 
-def read_frame(place: FramePlace) -> Message:
-    """The image message at its place: the last record of its chunk, behind at most its schema and channel.
+class StoredFrame(NamedTuple):
+    """The two messages of a frame, encoded. `image` is part of the memory that the chunk was read into."""
 
-    It is read by itself, because new memory for 5 MB costs more than all else that is done here.
-    """
-    chunk = place.chunk
+    meta: bytes
+    image: memoryview
+
+
+def read_frame(place: FramePlace) -> StoredFrame:
+    """The messages of the frame at that place, the CRC of its chunk checked."""
     with reading(place.path), place.path.open("rb", buffering=0) as file:
-        data, head = _frame_chunk(file, chunk, _FRAME_HEAD_BYTES)
-        content_begin = RECORD.size + head.begin
-        begin = _image_record(data, content_begin)
-        _, length, number = _MESSAGE_START.unpack_from(data, begin)
-        sequence, time_ns, _ = _MESSAGE_REST.unpack_from(data, begin + _MESSAGE_START.size)
-        begin += _MESSAGE_BYTES
-        if length != chunk.length - begin + _MESSAGE_BYTES - RECORD.size:
-            raise ValueError("a frame's chunk holds more than the frame")
-        image = _read(file, chunk.offset + begin, chunk.length - begin)
-        check_crc(image, head.crc, "a chunk", data[content_begin:begin])
-        if (number, time_ns) != (place.channel, place.time_ns):
-            raise ValueError("the index lists another frame")
-        return Message(CAMERA_IMAGE, sequence, time_ns, image)
+        meta, image = frame_messages(_chunk(file, place.chunk))
+        with naming(place.path):
+            stored = decode_frame_meta(bytes(meta.data))
+        if repr(stored) != repr(place.meta):  # NaN is not equal to itself
+            raise ValueError("the table of frames lists another frame")
+        stated = (place.time_ns, place.sequence)
+        if any((message.time_ns, message.sequence) != stated for message in (meta, image)):
+            raise ValueError("a frame's messages are not of one frame")
+        return StoredFrame(bytes(meta.data), image.data)
 
 
-def _image_record(data: bytes, offset: int) -> int:
-    """Where the first message record is, of the records from `offset` on."""
-    opcode, length = RECORD.unpack_from(data, offset)
-    while opcode != Opcode.MESSAGE:
-        offset += RECORD.size + length
-        opcode, length = RECORD.unpack_from(data, offset)
-    return offset
+class FrameMessage(NamedTuple):
+    """A message of a frame's chunk, where it was read."""
+
+    sequence: int
+    time_ns: int
+    data: memoryview
+
+
+def frame_messages(chunk: memoryview) -> tuple[FrameMessage, FrameMessage]:
+    """The description and the image in a frame's chunk; ValueError when it holds something else."""
+    found: list[FrameMessage] = []
+    for opcode, record in records(chunk):
+        if opcode == Opcode.MESSAGE:
+            sequence, time_ns, _ = _MESSAGE_REST.unpack_from(record, 2)
+            found.append(FrameMessage(sequence, time_ns, record[MESSAGE.size :]))
+    if len(found) != 2:
+        raise ValueError("a chunk of the frames does not hold one frame")
+    return found[0], found[1]

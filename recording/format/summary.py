@@ -24,6 +24,7 @@ _TAIL_BYTES = 1 << 16  # read at once from the end: the whole summary of most se
 # Messages, schemas, channels, attachments, metadata, chunks, first and last log time, length of the map behind them
 _STATISTICS = struct.Struct("<QHIIIIqqI")
 _CHUNK_INDEX = struct.Struct("<qqQQI")  # first and last log time, offset, length, length of the map behind them
+_ATTACHMENT_INDEX = struct.Struct("<QQQQQI")  # offset, length, log and create time, size of the data, that of the name
 _MAP_ENTRY = struct.Struct("<HQ")  # channel id; count of its messages or offset of its message index
 
 
@@ -69,6 +70,16 @@ class Summary:
             elif opcode == Opcode.CHUNK_INDEX:
                 break  # of these there may be thousands, and no more channels behind them
         return {channel.id: (channel, schemas[channel.schema_id]) for channel in channels}
+
+    def attachments(self) -> dict[str, tuple[int, int]]:
+        """Name -> where its record is, and how long; of one name the last."""
+        found: dict[str, tuple[int, int]] = {}
+        for opcode, record in records(self.content):
+            if opcode == Opcode.ATTACHMENT_INDEX:
+                offset, length, _, _, _, name_bytes = _ATTACHMENT_INDEX.unpack_from(record)
+                begin = _ATTACHMENT_INDEX.size
+                found[bytes(record[begin : begin + name_bytes]).decode()] = offset, length
+        return found
 
     def chunks(self) -> Iterator[ChunkPlace]:
         """The chunks in the order of the file."""

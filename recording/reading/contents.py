@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 
 from thermostand.foundation.items import Event, StepMark
 from thermostand.recording.format import messages
-from thermostand.recording.format.messages import FrameMeta
 from thermostand.recording.format.records import Message
-
-FrameKey = tuple[int, int]  # time_ns and sequence, which an image and its description share
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +35,6 @@ class Channel:
 class Contents:
     """Everything but the images; `channels` by their names."""
 
-    metas: list[tuple[FrameKey, FrameMeta]] = field(default_factory=list[tuple[FrameKey, FrameMeta]])
     events: list[Event] = field(default_factory=list[Event])
     marks: list[StepMark] = field(default_factory=list[StepMark])
     channels: dict[str, Channel] = field(default_factory=dict[str, Channel])
@@ -46,9 +42,6 @@ class Contents:
     def receive(self, message: Message) -> None:
         """Keep what a message of the telemetry says; SessionError when it cannot be read."""
         match message.topic:
-            case messages.CAMERA_META:
-                key = message.time_ns, message.sequence
-                self.metas.append((key, messages.decode_frame_meta(message.data)))
             case messages.EVENT:
                 self.events.append(messages.decode_event(message.data, message.time_ns))
             case messages.STEP:

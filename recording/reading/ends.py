@@ -8,22 +8,32 @@ moment between two of them, and counts as incomplete.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import RUN_BEGINS, RUN_END, TELL_PLAN
 from thermostand.foundation.items import Event, StepMark, StepState
+from thermostand.recording.format.chain import Link
 from thermostand.recording.format.holes import Hole
-from thermostand.recording.format.inventory import State
+from thermostand.recording.format.inventory import SegmentFile, State
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.utc_offsets import UtcOffsets
-from thermostand.recording.reading.coverage import Coverage
 from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts
 from thermostand.recording.reading.run_word import last_run_event
 
 # The journal may be ahead of telemetry that waits for its next commit, on a virtual clock for 20 s.
 AHEAD_NS = 60 * NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """links: the finished segments that were read, by their names, in order. holes: those that the session's own record
+    lists, as a copy of an incomplete session does."""
+
+    files: Sequence[SegmentFile]
+    links: dict[str, Link]
+    holes: tuple[Hole, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +63,7 @@ def lost_end(
     why = _why(end_ns, last.salvaged, last_run_event(events), frozenset(_done(marks)), journal, utc)
     if not why:
         return None
-    why += frames_of_plan(events, sum(link.count for link in coverage.links.values() if link.series == FRAMES))
+    why += frames_of_plan(events, sum(link.count // 2 for link in coverage.links.values() if link.series == FRAMES))
     to_ns = None if journal is None or journal.last_ns <= end_ns else journal.last_ns
     return LostEnd(Hole(TELEMETRY, series[-1].number + 1, None, end_ns, to_ns), why)
 

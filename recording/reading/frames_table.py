@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event, StepMark
-from thermostand.recording.format.messages import FrameMeta
+from thermostand.recording.format.layout import FRAMES
+from thermostand.recording.format.records import FramePlace
 from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.columns import Column
 from thermostand.recording.reading.interpolation import Float, interpolated
@@ -82,11 +83,6 @@ class FramesTable:
 class Recorded(Protocol):
     """What is asked of a session."""
 
-    @property
-    def frame_metas(self) -> list[tuple[int, FrameMeta]]:
-        """(time_ns, description) of every frame."""
-        ...
-
     def steps(self) -> list[StepMark]:
         """Every step mark."""
         ...
@@ -104,26 +100,24 @@ class Recorded(Protocol):
         ...
 
 
-def frames_table(session: Recorded, files: list[str], times_ns: NDArray[np.int64]) -> FramesTable:
-    """The table of the frames at these instants (F,), which lie in these files."""
-    described: dict[int, list[FrameMeta]] = {}
-    for time_ns, meta in session.frame_metas:
-        described.setdefault(time_ns, []).append(meta)
-    metas = [described[time_ns].pop(0) if described.get(time_ns) else None for time_ns in times_ns.tolist()]
-    step_id = ["" if meta is None else meta.step_id for meta in metas]
+def frames_table(session: Recorded, places: Sequence[FramePlace]) -> FramesTable:
+    """The table of the frames at these places."""
+    metas = [place.meta for place in places]
+    times_ns = np.array([meta.time_ns for meta in metas], np.int64)
+    step_id = [meta.step_id for meta in metas]
     steps = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
     begins_ns = begins_of(session.events())
     named = zip(times_ns.tolist(), step_id, strict=True)
     return FramesTable(
-        file=np.array(files, np.str_),
+        file=np.array([f"{FRAMES}/{place.path.name}" for place in places], np.str_),
         time_ns=times_ns,
-        camera=np.array(["" if meta is None else meta.channel.partition(".")[0] for meta in metas], np.str_),
+        camera=np.array([meta.channel.partition(".")[0] for meta in metas], np.str_),
         step_id=np.array(step_id, np.str_),
         role=np.array([str(steps.get(name, {}).get("role") or "") for name in step_id], np.str_),
         superseded=np.array([is_superseded(time_ns, name, begins_ns) for time_ns, name in named], bool),
         chamber_degC=np.array([_number(steps.get(name, {}).get("chamber_degC")) for name in step_id], np.float64),
-        camera_degC=np.array([math.nan if meta is None else meta.camera_degC for meta in metas], np.float64),
-        flags=np.array(["" if meta is None else ",".join(meta.flags) for meta in metas], np.str_),
+        camera_degC=np.array([meta.camera_degC for meta in metas], np.float64),
+        flags=np.array([",".join(meta.flags) for meta in metas], np.str_),
         air_degC=_at(session, _AIR, times_ns),
         positions={axis: _at(session, f"{axis}.position", times_ns) for axis in _axes(session)},
     )

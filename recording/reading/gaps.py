@@ -5,7 +5,7 @@ begins that much after the recording or ends that much before it; a failed read 
 Channels of a device that were silent together are one silence, and so are devices, within their own spacing.
 
 Frames are missing where the camera or its wire lost some (`dropped` of the frame after them), where the recorder lost
-some (its events `frames_dropped` say which), and where an image or its description is not there.
+some (its events `frames_dropped` say which), and where a step that is done has fewer than it says.
 """
 
 from __future__ import annotations
@@ -115,6 +115,16 @@ def _silence(group: Sequence[_Hole], channels_of: Mapping[str, frozenset[str]]) 
 
 def _names(hole: _Hole, channels: frozenset[str]) -> list[str]:
     return [hole.device] if hole.channels == channels else sorted(hole.channels)
+
+
+def lost_frames_of(step_id: str, events: Iterable[Event]) -> int:
+    """How many frames the recorder itself said it lost in events that name this step, or none."""
+    of_it: list[Event] = []
+    for event in events:
+        steps = event.data.get("steps") if event.kind == FRAMES_DROPPED else []
+        if steps is None or (isinstance(steps, list) and step_id in steps):
+            of_it.append(event)
+    return sum(map(len, reported_blocks(of_it)))
 
 
 def reported_blocks(events: Iterable[Event]) -> list[range]:

@@ -16,7 +16,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event, StepMark
 from thermostand.recording.format import messages
 from thermostand.recording.format.chain import Link, misplaced, missing_segments
-from thermostand.recording.format.damage import DAMAGE, reading
+from thermostand.recording.format.damage import reading
 from thermostand.recording.format.decoded_items import event_of, step_of
 from thermostand.recording.format.holes import holes_in, segments_text
 from thermostand.recording.format.inventory import SegmentFile, State, inventory
@@ -25,8 +25,7 @@ from thermostand.recording.format.mcap_bytes import Source
 from thermostand.recording.format.records import Head, read_head, telemetry_messages
 from thermostand.recording.format.summary import Summary, read_summary
 from thermostand.recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
-from thermostand.recording.reading.coverage import Coverage, coverage_of
-from thermostand.recording.reading.ends import is_of_a_run, lost_end
+from thermostand.recording.reading.ends import Coverage, frames_of_plan, is_of_a_run, lost_end
 from thermostand.recording.reading.extent import extent_of
 from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
 from thermostand.recording.reading.kept_originals import is_recovered
@@ -137,29 +136,32 @@ def glance(path: Path) -> Glance:
     near, journal = _near([each for each in seen if each.file.series == TELEMETRY]), journal_facts(path)
     extent, utc = extent_of(metadata), offsets_of(near.events)
     links = {each.file.name: each.link for each in seen}
-    coverage = coverage_of(files, links, near.events, holes_in(metadata.get("holes", "")), journal)
+    coverage = Coverage(files, links, holes_in(metadata.get("holes", "")))
     troubles += [*_misfits(seen, metadata), *_kept(files, seen)]
     if journal is not None and journal.damage and extent is None:
         troubles.append(f"{JOURNAL_NAME}: {journal.damage}")
     if damage := read_notes(path).damage:
         troubles.append(f"{NOTES_NAME}: {damage}")
     missing = [*_missing(coverage), *(() if extent else _lost_end(coverage, near, journal, utc))]
-    if not troubles and not missing:
-        troubles, missing = _frames_held_against_descriptions(path, seen, coverage)
     is_recording = any(file.state is State.RECORDING for file in files)
+    frames = sum(each.link.count // 2 for each in seen if each.file.series == FRAMES)
+    run = extent.run if extent else run_word(near.events, journal, is_recording=is_recording)
+    is_short = run is not Run.COMPLETE or frames_of_plan(near.events, frames)
+    if is_short and not is_recording and not troubles and not missing:
+        troubles, missing = _steps_without_frames(path)
     return Glance(
         path,
         files,
         metadata,
         attachments,
-        sum(each.summary.statistics.message_count for each in seen if each.file.series == FRAMES),
+        frames,
         min((statistics.message_start_time for statistics in totals), default=None),
         max((statistics.message_end_time for statistics in totals), default=None),
         tuple(troubles),
         tuple(missing),
         utc,
-        extent.run if extent else run_word(near.events, journal, is_recording=is_recording),
-        has_recorded_temperature(each.file.path for each in seen if each.file.series == TELEMETRY),
+        run,
+        has_recorded_temperature(each.file.path for each in seen if each.file.series == FRAMES),
     )
 
 
@@ -223,28 +225,15 @@ def _lost_end(coverage: Coverage, near: _Near, journal: JournalFacts | None, utc
         yield f"the end of the telemetry is missing: {lost.why}"
 
 
-def _frames_held_against_descriptions(
-    path: Path, seen: Sequence[_Seen], coverage: Coverage
-) -> tuple[list[str], list[str]]:
-    """Where the numbers of images and descriptions differ, the reasons are looked for in all of the telemetry:
-    troubles, and what is missing."""
-    frames = sum(each.link.count for each in seen if each.file.series == FRAMES)
-    if frames == sum(map(_descriptions, seen)) or any(file.state is State.RECORDING for file in coverage.files):
-        return [], []
+def _steps_without_frames(path: Path) -> tuple[list[str], list[str]]:
+    """Where there are fewer frames than planned, the reasons are looked for in all of the telemetry: troubles, and what
+    is missing."""
     try:
         session = Session.open(path)
         missing = [hole.text(session.utc) for hole in session.holes if not hole.excused]
     except SessionError as error:
         return [within(path, error)], []
     return [], [f"{text} missing" for text in missing]
-
-
-def _descriptions(each: _Seen) -> int:
-    counts = each.summary.statistics.channel_message_counts
-    with suppress(*DAMAGE):
-        channels = each.summary.channels().items()
-        return sum(counts.get(number, 0) for number, (channel, _) in channels if channel.topic == messages.CAMERA_META)
-    return 0
 
 
 def within(directory: Path, error: SessionError) -> str:

@@ -5,7 +5,7 @@ part of the answer, not a reason to give none.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,10 +14,10 @@ import numpy as np
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import RUN_END, TELL_PLAN
 from thermostand.foundation.items import Event, StepMark, StepState
-from thermostand.recording.format.images import decode_image
 from thermostand.recording.format.inventory import SegmentFile, State
 from thermostand.recording.format.layout import FRAMES
-from thermostand.recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
+from thermostand.recording.format.messages import FrameMeta
+from thermostand.recording.format.records import frame_places, telemetry_messages
 from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
 from thermostand.recording.reading.contents import Channel, Contents
 from thermostand.recording.reading.gaps import Silence, reported_blocks, silences
@@ -53,17 +53,15 @@ class Temperature:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """The images. `pixels`: those of the first, as in `2448 x 2048 px, 8 bit`; schema and pixels are "" without any.
-    described: descriptions in the telemetry. dropped: frames that the camera or its wire lost, as the descriptions say.
+    """The images. `pixels`: those of the first, as in `2448 x 2048 px, 12 bit`, "" without any. dropped: frames that
+    the camera or its wire lost, as the descriptions say.
     lost_by_recorder: frames of which its events say so. flagged: how many have each flag."""
 
     count: int
     size_bytes: int
-    schema: str
     pixels: str
     first_ns: int | None
     last_ns: int | None
-    described: int
     dropped: int
     lost_by_recorder: int
     flagged: Mapping[str, int] = field(default_factory=dict[str, int])
@@ -110,14 +108,14 @@ class _Reading:
 
     directory: Path
     contents: Contents = field(default_factory=Contents)
-    places: list[FramePlace] = field(default_factory=list[FramePlace])
+    metas: list[FrameMeta] = field(default_factory=list[FrameMeta])
     troubles: list[str] = field(default_factory=list[str])
 
     def read(self, file: SegmentFile) -> None:
         """A finished segment, as far as it goes."""
         try:
             if file.series == FRAMES:
-                self.places.extend(frame_places(file.path))
+                self.metas.extend(place.meta for place in frame_places(file.path))
                 return
             for message in telemetry_messages(file.path, lambda channel: True):
                 self.contents.receive(message)
@@ -138,7 +136,7 @@ def overview(path: Path) -> Overview:
     return Overview(
         seen,
         tuple(dict.fromkeys((*seen.troubles, *read.troubles))),
-        tuple(_steps(contents)),
+        tuple(_steps(contents, read.metas)),
         frames,
         tuple(_temperature(name, channel) for name, channel in sorted(contents.channels.items()) if channel.is_degC),
         tuple(silences(times_ns)),
@@ -146,9 +144,9 @@ def overview(path: Path) -> Overview:
     )
 
 
-def _steps(contents: Contents) -> Iterator[Step]:
+def _steps(contents: Contents, metas: Sequence[FrameMeta]) -> Iterator[Step]:
     """The steps in order of their index; of one that was begun again the last time counts."""
-    by_camera = Counter((meta.step_id, meta.channel) for _, meta in contents.metas)
+    by_camera = Counter((meta.step_id, meta.channel) for meta in metas)
     frames = Counter[str]()
     for (of_step, _), count in by_camera.items():
         frames[of_step] = max(frames[of_step], count)
@@ -167,34 +165,18 @@ def _steps(contents: Contents) -> Iterator[Step]:
 
 def _frames(seen: Glance, read: _Reading) -> Frames:
     size_bytes = sum(file.size_bytes for file in seen.files if file.series == FRAMES)
-    times_ns = [place.time_ns for place in read.places]
-    contents = read.contents
+    metas = read.metas
+    times_ns = [meta.time_ns for meta in metas]
     return Frames(
-        len(times_ns),
+        len(metas),
         size_bytes,
-        read.places[0].schema if read.places else "",
-        _pixels(read),
+        f"{metas[0].width} x {metas[0].height} px, {metas[0].significant_bits} bit" if metas else "",
         min(times_ns, default=None),
         max(times_ns, default=None),
-        len(contents.metas),
-        sum(meta.dropped for _, meta in contents.metas),
-        sum(map(len, reported_blocks(contents.events))),
-        Counter(flag for _, meta in contents.metas for flag in meta.flags),
+        sum(meta.dropped for meta in metas),
+        sum(map(len, reported_blocks(read.contents.events))),
+        Counter(flag for meta in metas for flag in meta.flags),
     )
-
-
-def _pixels(read: _Reading) -> str:
-    """Of the first image; a damaged one is a trouble."""
-    if not read.places:
-        return ""
-    try:
-        place = read.places[0]
-        pixels = decode_image(place.schema, read_frame(place).data).pixels
-    except SessionError as error:
-        read.troubles.append(within(read.directory, error))
-        return ""
-    height, width = pixels.shape
-    return f"{width} x {height} px, {8 * pixels.itemsize} bit"
 
 
 def _temperature(name: str, channel: Channel) -> Temperature:

@@ -21,20 +21,17 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from thermostand.foundation.errors import NotThere, SessionError
-from thermostand.foundation.items import Event, Item, Original, StepMark
+from thermostand.foundation.items import Event, Item, Original, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
 from thermostand.recording.format.chain import Link, misplaced
 from thermostand.recording.format.damage import FileDamaged, naming
 from thermostand.recording.format.decoded_items import (
-    Description,
-    ImagesToCome,
     RecordedImage,
-    describes_frame,
-    description_of,
     event_of,
     frame_of,
     item_of,
+    recorded_image,
     stands_for_item,
     step_of,
 )
@@ -55,14 +52,13 @@ from thermostand.recording.format.records import (
     MessageSpan,
     frame_places,
     message_span,
-    read_frame,
     read_head,
     telemetry_messages,
 )
 from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
 from thermostand.recording.reading.columns import Column, TopicColumns
 from thermostand.recording.reading.contents import Contents
-from thermostand.recording.reading.coverage import coverage_of
+from thermostand.recording.reading.ends import Coverage
 from thermostand.recording.reading.extent import extent_of
 from thermostand.recording.reading.frames_table import FramesTable, frames_table
 from thermostand.recording.reading.hole_finder import find_holes
@@ -71,7 +67,7 @@ from thermostand.recording.reading.run_word import Run, run_word
 from thermostand.recording.reading.segment_files import number_of, segments_in, segments_of
 
 T = TypeVar("T")
-_TOPICS_OF_HOLES = (messages.CAMERA_META, messages.EVENT, messages.STEP)
+_TOPICS_OF_HOLES = (messages.EVENT, messages.STEP)
 
 
 class Session:
@@ -101,7 +97,6 @@ class Session:
         self._units: dict[str, str] = {}
         self._doubted: dict[str, list[int]] = {}
         self._places_of: dict[Path, list[FramePlace]] = {}
-        self._metas_of: dict[Path, dict[tuple[int, int], bytes]] = {}
 
     @classmethod
     def open(cls, path: Path | str) -> Session:
@@ -222,7 +217,7 @@ class Session:
     @property
     def frame_count(self) -> int:
         """How many frames were recorded."""
-        return sum(span.count for span in self._spans)
+        return sum(self._frames_in_segments)
 
     @property
     def frame_times_ns(self) -> NDArray[np.int64]:
@@ -231,85 +226,62 @@ class Session:
 
     def frames_table(self) -> FramesTable:
         """What is known of each frame as columns; no image is decoded."""
-        places = list(self._places())
-        files = [f"{FRAMES}/{place.path.name}" for place in places]
-        return frames_table(self, files, np.array([place.time_ns for place in places], np.int64))
+        return frames_table(self, list(self._places()))
 
     def frame(self, index: int) -> Frame:
         """The frame of that index, counted from 0 in order of time; SessionError when there is none."""
         if not 0 <= index < self.frame_count:
             raise SessionError(f"{self.path}: has no frame {index}; it has {self.frame_count}, counted from 0")
         if not self._is_in_order:
-            return frame_of(self._image(self._sorted_places[index]))
-        ends = list(accumulate(span.count for span in self._spans))
+            return frame_of(recorded_image(self._sorted_places[index]))
+        ends = list(accumulate(self._frames_in_segments))
         number = bisect_right(ends, index)
         places = self._places_in(self._frames[number])
-        return frame_of(self._image(places[index - ends[number]]))  # counted from the segment's end
+        return frame_of(recorded_image(places[index - ends[number]]))  # counted from the segment's end
 
     def frames(self) -> Iterator[Frame]:
-        """The frames in order of time, each read and decoded when asked for. A frame whose description did not reach
-        the disk has NaN for exposure, gain and temperature."""
+        """The frames in order of time, each read and decoded when asked for."""
         return map(frame_of, self.images())
 
     def images(self) -> Iterator[RecordedImage]:
         """The images in order of time as they were recorded, each read when asked for and not decoded."""
-        return map(self._image, self._places())
+        return map(recorded_image, self._places())
 
     def items(self) -> Iterator[Item]:
         """Every batch, frame, step mark and event in the order of their publication, each read when asked for.
+        Publishing the items to a recorder gives the same messages again."""
+        return (item for _, item in self.published())
 
-        A frame's place in that order is that of its description; a frame whose description is missing (an
-        UndescribedFrame) comes in order of time, and a description whose image is missing is none of these items.
-        Publishing the items to a recorder gives the same messages again.
-        """
-        return (item for item in self.items_and_descriptions() if not isinstance(item, Description))
+    def published(self) -> Iterator[tuple[int, Item]]:
+        """As `items`, with the instants of their publication. A frame comes behind what was published at its instant,
+        but before the end of its step."""
+        frames = iter(sorted(self._places(), key=attrgetter("meta.published_ns")))
+        place = next(frames, None)
+        for item in self._decoded(stands_for_item, item_of):
+            ended = item.step_id if isinstance(item, StepMark) and item.state is not StepState.STARTED else None
+            while place is not None and (
+                place.meta.published_ns < item.time_ns
+                or (place.meta.published_ns == item.time_ns and place.meta.step_id == ended)
+            ):
+                yield place.meta.published_ns, frame_of(recorded_image(place))
+                place = next(frames, None)
+            yield item.time_ns, item
+        while place is not None:
+            yield place.meta.published_ns, frame_of(recorded_image(place))
+            place = next(frames, None)
 
-    def items_and_descriptions(self) -> Iterator[Item | Description]:
-        """As `items`, with the descriptions whose images are missing at their places."""
-        images = ImagesToCome(self._places(), (time_ns for time_ns, _ in self.frame_metas), self._image)
-        for message, item in self._decoded(stands_for_item, lambda message: (message, item_of(message))):
-            yield from map(frame_of, images.undescribed_before(message.time_ns))
-            if item is None:
-                yield from images.described_by(message)
-            else:
-                yield item
-        yield from map(frame_of, images.undescribed_before(None))
-
-    @property
-    def frame_metas(self) -> list[tuple[int, messages.FrameMeta]]:
-        """(time_ns, description) of every frame in order of publication, also of those whose image was lost."""
-        return list(self._decoded(describes_frame, description_of))
-
-    def _image(self, place: FramePlace) -> RecordedImage:
-        message = read_frame(place)
-        meta = self._meta(message.time_ns, message.sequence)
-        return RecordedImage(place.schema, message.data, message.sequence, message.time_ns, meta, place.path)
-
-    def _meta(self, time_ns: int, sequence: int) -> messages.FrameMeta | None:
-        """A frame's description, None when it is lost; only segments with messages before and after are read."""
-        for path, span in self._telemetry_spans:
-            if span.first_ns <= time_ns <= span.last_ns:
-                found = self._metas_in(path).get((time_ns, sequence))
-                if found is not None:
-                    with naming(path):
-                        return messages.decode_frame_meta(found)
-        return None
-
-    @cached_property
-    def _telemetry_spans(self) -> list[tuple[Path, MessageSpan]]:
-        return [(path, message_span(path)) for path in self._telemetry]
-
-    def _metas_in(self, segment: Path) -> dict[tuple[int, int], bytes]:
-        """(time, sequence) -> the description's message, not decoded."""
-        if segment not in self._metas_of:
-            self._check(segment)
-            found = telemetry_messages(segment, describes_frame)
-            self._metas_of[segment] = {(message.time_ns, message.sequence): message.data for message in found}
-        return self._metas_of[segment]
+    def frame_metas(self) -> list[messages.FrameMeta]:
+        """The description of every frame, in order of time."""
+        return [place.meta for place in self._places()]
 
     @cached_property
     def _spans(self) -> list[MessageSpan]:
         return [message_span(path) for path in self._frames]
+
+    @property
+    def _frames_in_segments(self) -> list[int]:
+        """How many frames each segment has: two messages are one."""
+        return [span.count // 2 for span in self._spans]
 
     @cached_property
     def _is_in_order(self) -> bool:
@@ -350,12 +322,11 @@ class Session:
         contents = Contents()
         for message in self._decoded(lambda channel: channel.topic in _TOPICS_OF_HOLES, lambda message: message):
             contents.receive(message)
-        files, recorded = inventory(self.path), holes_in(self.metadata.get("holes", ""))
+        recorded = holes_in(self.metadata.get("holes", ""))
         links = {f"{path.parent.name}/{path.name}": self._link(path) for path in self.segments}
-        journal = journal_facts(self.path)
-        coverage = coverage_of(files, links, contents.events, recorded, journal)
+        journal, coverage = journal_facts(self.path), Coverage(inventory(self.path), links, recorded)
         is_part = extent_of(self.metadata) is not None
-        return find_holes(coverage, contents, self.frame_times_ns.tolist(), journal, is_part=is_part)
+        return find_holes(coverage, contents, self.frame_metas(), journal, is_part=is_part)
 
     def _link(self, segment: Path) -> Link:
         span = message_span(segment)

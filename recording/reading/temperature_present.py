@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.format.messages import CAMERA_META, FrameMeta, decode_frame_meta
-from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.format.messages import FrameMeta
+from thermostand.recording.format.records import frame_places
 
 NO_TEMPERATURE = "no frame has a good camera temperature"
 
@@ -25,12 +25,11 @@ def has_temperature(metas: Iterable[FrameMeta]) -> bool | None:
 
 
 def has_recorded_temperature(segments: Iterable[Path]) -> bool | None:
-    """By these segments of the telemetry, as far as they can be read."""
+    """By these segments of the frames, as far as they can be read."""
 
     def metas() -> Iterable[FrameMeta]:
         for path in segments:
             with suppress(SessionError):
-                for message in telemetry_messages(path, lambda channel: channel.topic == CAMERA_META):
-                    yield decode_frame_meta(message.data)
+                yield from (place.meta for place in frame_places(path))
 
     return has_temperature(metas())

@@ -2,7 +2,8 @@
 
 A block is what is written at once and acknowledged when it is on the disk: the opening of a segment, or a chunk and
 the message indexes behind it. What an interrupted write leaves is the beginning of a block, then zeros or nothing. A
-whole block was acknowledged, so damage that is longer than a block is a loss.
+whole block was acknowledged, so damage that is longer than a block is a loss. Of a block of which nothing was written
+the length is not known: it may be a quarter longer than any before.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Blocks:
         claim = claim_of(head)
         claimed_bytes = 0 if claim is None else self._claimed_bytes(claim)
         if written_end < begin + RECORD.size:  # the zeros may be the length's own
-            return begin + max(claimed_bytes, self._largest_bytes)
+            return begin + max(claimed_bytes, self._largest_bytes * 5 // 4)  # frames are of almost one size
         return begin + claimed_bytes
 
     def _claimed_bytes(self, claim: Claim) -> int:

@@ -23,7 +23,7 @@ from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from thermostand.recording.format.damage import DAMAGE
-from thermostand.recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
+from thermostand.recording.format.layout import FRAME_TABLE, SEGMENT_METADATA, SESSION_METADATA, contradicts
 from thermostand.recording.format.mcap_bytes import (
     MESSAGE,
     RECORD,
@@ -52,6 +52,7 @@ _ATTACHMENT_HEAD = rb"\x09(?=.{3}[\x00-\x1f]\x00{4}.{16}[\x01-\xff]\x00{3})"
 _SESSION_HEAD = rb"\x0c(?=.{8}\x07\x00{3}session)"
 _IN_OPENING = re.compile(_CHUNK_HEAD + b"|" + _ATTACHMENT_HEAD + b"|" + _SESSION_HEAD, re.DOTALL)
 _AFTER_OPENING = re.compile(_CHUNK_HEAD, re.DOTALL)
+_TABLE_HEAD = b"\x09" + len(FRAME_TABLE).to_bytes(4, "little") + FRAME_TABLE.encode()  # between them two times
 _HEAD_BYTES = 64  # more than any of the patterns looks at
 
 
@@ -221,7 +222,7 @@ class _Walk:
             window += WINDOW_BYTES
 
     def _note_gap(self, gap: Span) -> None:
-        if gap.begin == self._index_begin and gap.end == self._source.size:
+        if gap.end == self._source.size and (gap.begin == self._index_begin or self._is_table(gap.begin)):
             return
         if gap.end == self._source.size and self._blocks.is_torn(self._source, gap.begin):
             self.found.torn_bytes = gap.end - gap.begin
@@ -229,6 +230,11 @@ class _Walk:
             if not self.found.damages:
                 self._sound_attachments = dict(self.found.attachments)
             self.found.damages.append(gap)
+
+    def _is_table(self, begin: int) -> bool:
+        """Whether the table of frames begins there, behind the last of them, which is made anew."""
+        head = self._source.read(begin, len(_TABLE_HEAD) + RECORD.size)
+        return head[:1] == _TABLE_HEAD[:1] and head[RECORD.size + 16 :].startswith(_TABLE_HEAD[1:])
 
     def _take(self, record: _Proven) -> None:
         found = self.found
@@ -251,6 +257,8 @@ class _Walk:
             case Metadata(name=name, metadata=entries) if name == SEGMENT_METADATA:
                 if found.session is not None and contradicts(entries, found.session):
                     found.session, found.is_session_wrong = None, True
+            case Attachment(name=name) if name == FRAME_TABLE:
+                pass  # what it says stands in the chunks
             case Attachment() as attachment:
                 found.attachments[attachment.name] = attachment
             case DataEnd():

@@ -16,15 +16,16 @@ from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import blake2b
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import BinaryIO
 
 from mcap.records import Channel
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import sync_folder
+from thermostand.recording.format.images import ZSTD_LEVEL
 from thermostand.recording.format.layout import (
     DAMAGED,
     FINISHED,
@@ -43,10 +44,11 @@ from thermostand.recording.repair.opening import Opening, opening_of, segments_o
 from thermostand.recording.repair.segment_check import check_segment
 from thermostand.recording.repair.share_done import ReportShare, ShareDone, no_report
 from thermostand.recording.writing.locks import lock
-from thermostand.recording.writing.segment import CHUNK_BYTES
+from thermostand.recording.writing.mcap_writer import McapWriter
+from thermostand.recording.writing.segment import CHUNK_BYTES, FrameTable
 
 BEING_RECORDED = "is being recorded"
-COMPRESSION = {FRAMES: CompressionType.NONE, TELEMETRY: CompressionType.ZSTD}
+LEVELS = {FRAMES: ZSTD_LEVEL, TELEMETRY: 3}  # of zstd
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +81,7 @@ def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salv
     """Finish the unfinished segments of every session below `root`, without a look at the finished ones. SessionError
     as above."""
     left = {path.parent for pattern in (UNFINISHED, TEMPORARY) for path in root.glob(f"*/*/*{pattern}")}
-    folders = [folder for folder in sorted(left, reverse=True) if folder.name in COMPRESSION]  # telemetry is first
+    folders = [folder for folder in sorted(left, reverse=True) if folder.name in LEVELS]  # telemetry is first
     return _salvage_folders(folders, False, report)
 
 
@@ -161,12 +163,16 @@ class _Original:
 
     def messages(self) -> Iterator[tuple[Channel, StoredMessage]]:
         """What can be delivered, in order."""
-        if self.opening is None:
+        return chain.from_iterable(self.chunks())
+
+    def chunks(self) -> Iterator[list[tuple[Channel, StoredMessage]]]:
+        """The same, chunk by chunk."""
+        opening = self.opening
+        if opening is None:
             return
         for place in self.found.chunks:
-            for message in stored_messages(self.source, place):
-                if self.opening.knows(message.channel):
-                    yield self.opening.channels[message.channel], message
+            found = stored_messages(self.source, place)
+            yield [(opening.channels[each.channel], each) for each in found if opening.knows(each.channel)]
 
     @property
     def delivered(self) -> int:
@@ -275,43 +281,46 @@ def _new_file(path: Path) -> BinaryIO:
 def _write(file: BinaryIO, original: _Original) -> None:
     """The copy, in the form of recording/writing/segment.py: the opening first, one frame per chunk."""
     series = original.path.parent.name
-    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=COMPRESSION[series])
-    writer.start()
-    channels = _write_opening(writer, original)
-    for channel, message in original.messages():
-        writer.add_message(
-            channels[channel.id], message.log_time_ns, message.data, message.publish_time_ns, message.sequence
-        )
+    writer = McapWriter(CompressionType.ZSTD, CHUNK_BYTES, LEVELS[series])
+    table = FrameTable(writer)
+    channels = _write_opening(writer, table, original)
+    for messages in original.chunks():
+        for channel, message in messages:
+            number = channels[channel.id]
+            writer.add_message(number, message.log_time_ns, message.publish_time_ns, message.sequence, message.data)
+            table.note(number, message.data)
         if series == FRAMES:
-            writer.flush()
+            writer.end_chunk()
+        file.writelines(writer.take())
+    table.write(0)
     writer.finish()
+    file.writelines(writer.take())
 
 
-def _write_opening(writer: Writer, original: _Original) -> Mapping[int, int]:
+def _write_opening(writer: McapWriter, table: FrameTable, original: _Original) -> Mapping[int, int]:
     """Attachments, metadata, schemas and channels; channel numbers of the original -> of the copy."""
     opening = original.opening
     if opening is None:
         raise ValueError("a copy needs an opening")
     for attachment in opening.attachments.values():
-        writer.add_attachment(
-            attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
-        )
+        writer.add_attachment(attachment)
     number = int(original.finished.name.partition(".")[0])
     writer.add_metadata(SESSION_METADATA, dict(opening.session))
     place = segment_metadata(original.path.parent.name, number, opening.session)
     writer.add_metadata(SEGMENT_METADATA, place)
     writer.add_metadata(SALVAGE_METADATA, _salvage_metadata(original))
     schemas = {
-        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
+        schema.id: writer.add_schema(schema.name, schema.encoding, schema.data)
         for _, schema in sorted(opening.schemas.items())
     }
-    return {
-        channel.id: writer.register_channel(
-            channel.topic, channel.message_encoding, schemas[channel.schema_id], channel.metadata
-        )
-        for _, channel in sorted(opening.channels.items())
-        if opening.knows(channel.id)
-    }
+    channels: dict[int, int] = {}
+    for _, channel in sorted(opening.channels.items()):
+        if opening.knows(channel.id):
+            schema = schemas[channel.schema_id]
+            number = writer.add_channel(channel.topic, channel.message_encoding, schema, channel.metadata)
+            table.know(number, opening.schemas[channel.schema_id].name)
+            channels[channel.id] = number
+    return channels
 
 
 def _salvage_metadata(original: _Original) -> dict[str, str]:

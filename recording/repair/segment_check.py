@@ -34,7 +34,8 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from thermostand.recording.format.damage import DAMAGE
-from thermostand.recording.format.layout import SEGMENT_METADATA, SESSION_METADATA, contradicts
+from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA
+from thermostand.recording.format.layout import FRAME_TABLE, SEGMENT_METADATA, SESSION_METADATA, contradicts
 from thermostand.recording.format.mcap_bytes import (
     CHUNK,
     CRC,
@@ -48,6 +49,7 @@ from thermostand.recording.format.mcap_bytes import (
     records,
     stream,
 )
+from thermostand.recording.format.messages import frame_table
 from thermostand.recording.format.records import Message
 from thermostand.recording.format.summary import Summary, read_summary
 
@@ -65,18 +67,21 @@ class Damage(NamedTuple):
 
 @dataclass
 class SegmentCheck:
-    """What the walk through a segment found. `last_ns`: log time of its latest sound message."""
+    """What the walk through a segment found. descriptions: of its sound frames, as messages. `last_ns`: log time of its
+    latest sound message."""
 
     path: Path
     damages: list[Damage] = field(default_factory=list[Damage])
     metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    descriptions: list[bytes] = field(default_factory=list[bytes])
     messages: int = 0
     first_ns: float = inf
     last_ns: float = -inf
 
 
 def check_segment(path: Path, receive: Callable[[Message], None], report: Callable[[int], None]) -> SegmentCheck:
-    """Read the whole segment and hand each sound message to `receive`; `report` gets the number of bytes read so far.
+    """Read the whole segment and hand each sound message but those of frames to `receive`; `report` gets the number of
+    bytes read so far.
     Damage is not raised: it is listed, and the walk continues at the next place in the index."""
     check = SegmentCheck(path)
     try:
@@ -139,6 +144,7 @@ class _Walk:
         self._counts: Counter[int] = Counter()  # of messages, by channel
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
+        self._table: bytes | None = None  # of frames
 
     def run(self, report: Callable[[int], None]) -> None:
         """Read everything; raises one of DAMAGE when the index does not cover the whole file."""
@@ -193,6 +199,8 @@ class _Walk:
         elif place in index.attachments:
             attachment = Attachment.read(stream(content))
             _check_same(bytes_of(attachment), data, "an attachment")
+            if attachment.name == FRAME_TABLE:
+                self._table = attachment.data
         else:
             metadata = Metadata.read(stream(content))
             _check_same(bytes_of(metadata), data, "a metadata record")
@@ -230,10 +238,12 @@ class _Walk:
         offset = 0
         for opcode, content in records(data):
             if opcode == Opcode.MESSAGE:
-                channel, sequence, time_ns, _ = MESSAGE.unpack_from(content)
-                topic = self._index.channels[channel].topic  # the first chunk, which has it too, may be damaged
-                message = Message(topic, sequence, time_ns, bytes(content[MESSAGE.size :]))
-                placed.append(_Placed(channel, offset, time_ns, message))
+                number, sequence, time_ns, _ = MESSAGE.unpack_from(content)
+                channel = self._index.channels[number]  # the first chunk, which has it too, may be damaged
+                schema = self._index.schemas[channel.schema_id].name
+                data_bytes = b"" if schema == IMAGE_SCHEMA else bytes(content[MESSAGE.size :])
+                message = Message(channel.topic, sequence, time_ns, data_bytes)
+                placed.append(_Placed(number, offset, time_ns, schema, message))
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream(content))
                 self._schemas[schema.id] = schema
@@ -251,7 +261,10 @@ class _Walk:
         check.first_ns = min(check.first_ns, placed.time_ns)
         check.last_ns = max(check.last_ns, placed.time_ns)
         self._counts[placed.channel] += 1
-        self._receive(placed.message)
+        if placed.schema == META_SCHEMA:
+            check.descriptions.append(placed.message.data)
+        elif placed.schema != IMAGE_SCHEMA:
+            self._receive(placed.message)
 
     def _data_end(self, place: int, data: bytes) -> None:
         """Our writer makes no CRC of the whole data section (0): chunks and attachments have their own."""
@@ -263,6 +276,8 @@ class _Walk:
         # Schemas and channels go into the first chunk; a segment without a message has none.
         if index.chunks and (self._schemas, self._channels) != (index.schemas, index.channels):
             raise ValueError("its schemas or channels are not those in its index")
+        if (self._table or b"") != frame_table(check.descriptions):
+            raise ValueError("its table of frames is not that of its frames")
         found = Statistics(
             attachment_count=len(index.attachments),
             channel_count=len(index.channels),
@@ -279,11 +294,12 @@ class _Walk:
 
 
 class _Placed(NamedTuple):
-    """A message, its channel's number and where it begins in its chunk."""
+    """A message, its channel's number, where it begins in its chunk, and its schema's name."""
 
     channel: int
     offset: int
     time_ns: int
+    schema: str
     message: Message
 
 

@@ -8,16 +8,16 @@ How the run ended is another matter: a stopped run has sound files.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
+from math import inf
 from pathlib import Path
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import FRAMES_DROPPED
 from thermostand.recording.format.chain import MOST_MISSING, Link, foreign_numbers, misplaced, missing_segments
 from thermostand.recording.format.holes import Hole, holes_in, segments_text
-from thermostand.recording.format.images import CAMERA_IMAGE
 from thermostand.recording.format.inventory import SegmentFile, State, inventory
 from thermostand.recording.format.layout import (
     FINISHED,
@@ -28,14 +28,14 @@ from thermostand.recording.format.layout import (
     TELEMETRY,
     unknown_format,
 )
+from thermostand.recording.format.messages import FrameMeta, decode_frame_meta
 from thermostand.recording.format.records import Message
 from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
-from thermostand.recording.reading.contents import Contents, FrameKey
-from thermostand.recording.reading.coverage import Coverage, coverage_of
-from thermostand.recording.reading.ends import is_of_a_run, lost_end
+from thermostand.recording.reading.contents import Contents
+from thermostand.recording.reading.ends import Coverage, is_of_a_run, lost_end
 from thermostand.recording.reading.extent import Extent, extent_of
-from thermostand.recording.reading.frame_account import frame_account
-from thermostand.recording.reading.gaps import reported_blocks, silences
+from thermostand.recording.reading.gaps import silences
+from thermostand.recording.reading.hole_finder import all_frames_are_read, find_shortages
 from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
 from thermostand.recording.reading.kept_originals import is_recovered
 from thermostand.recording.reading.notes import NOTES_NAME, Notes, read_notes
@@ -96,30 +96,18 @@ class _Read:
 
     files: tuple[SegmentFile, ...]
     contents: Contents = field(default_factory=Contents)
-    images: Counter[FrameKey] = field(default_factory=Counter[FrameKey])
+    metas: list[FrameMeta] = field(default_factory=list[FrameMeta])
     checks: dict[str, SegmentCheck] = field(default_factory=dict[str, SegmentCheck])
 
-    def receive(self, message: Message) -> None:
-        """Keep what is compared later; SessionError when the message cannot be read."""
-        if message.topic == CAMERA_IMAGE:
-            self.images[message.time_ns, message.sequence] += 1
-        else:
-            self.contents.receive(message)
+    def is_damaged(self, series: str) -> bool:
+        """What is missing of the series may be in damage that is a finding already."""
+        return any(check.damages for name, check in self.checks.items() if name.startswith(f"{series}/"))
 
-    def is_damaged_at(self, series: str, time_ns: int) -> bool:
-        """What the series held of that instant may be in damage that is a finding already."""
-        return any(
-            damage.begin_ns <= time_ns <= damage.end_ns
-            for name, check in self.checks.items()
-            if name.startswith(f"{series}/")
-            for damage in check.damages
-        )
-
-    def coverage(self, journal: JournalFacts | None) -> Coverage:
+    def coverage(self) -> Coverage:
         """Which instants the segments that were read cover."""
         session = self.session()
         links = {file.name: _link(file, self.checks[file.name]) for file in self.files if file.name in self.checks}
-        return coverage_of(self.files, links, self.contents.events, holes_in(session.get("holes", "")), journal)
+        return Coverage(self.files, links, holes_in(session.get("holes", "")))
 
     def session(self) -> dict[str, str]:
         """The record `session` that most segments have."""
@@ -163,7 +151,7 @@ def verify(path: Path, report: Callable[[float, str], None] = no_report) -> Veri
         read.checks[file.name] = _checked(file, read, report, done_bytes)
         done_bytes += file.size_bytes
     journal, utc = journal_facts(path), offsets_of(read.contents.events)
-    coverage = read.coverage(journal)
+    coverage = read.coverage()
     extent = extent_of(read.session())
     findings = (
         *_format(read.session()),
@@ -174,15 +162,15 @@ def verify(path: Path, report: Callable[[float, str], None] = no_report) -> Veri
         *_metadata(finished, read),
         *(() if extent else _journal_and_end(read, coverage, journal, utc)),
         *_notes(read_notes(path)),
-        *_frames_against_descriptions(read, coverage),
-        *_frames_lost(read.contents),
+        *(() if extent else _steps_without_frames(read, coverage)),
+        *_frames_lost(read),
         *_silences(read.contents),
-        *_camera_temperature(read.contents),
+        *_camera_temperature(read),
     )
     total = sum(check.messages for check in read.checks.values())
     is_recording = any(file.state is State.RECORDING for file in files)
     run = extent.run if extent else run_word(read.contents.events, journal, is_recording=is_recording)
-    return Verification(findings, len(finished), total, read.images.total(), done_bytes, run)
+    return Verification(findings, len(finished), total, len(read.metas), done_bytes, run)
 
 
 def _checked(file: SegmentFile, read: _Read, report: Callable[[float, str], None], before_bytes: int) -> SegmentCheck:
@@ -190,11 +178,16 @@ def _checked(file: SegmentFile, read: _Read, report: Callable[[float, str], None
 
     def receive(message: Message) -> None:
         try:
-            read.receive(message)
+            read.contents.receive(message)
         except SessionError as error:
             unreadable.append(Damage(str(error), message.time_ns, message.time_ns))
 
     check = check_segment(file.path, receive, lambda done_bytes: report(before_bytes + done_bytes, file.name))
+    for description in check.descriptions:
+        try:
+            read.metas.append(decode_frame_meta(description))
+        except SessionError as error:
+            unreadable.append(Damage(str(error), -inf, inf))
     check.damages.extend(unreadable)
     return check
 
@@ -321,44 +314,30 @@ def _entries(metadata: dict[str, str] | None) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((metadata or {}).items()))
 
 
-def _frames_against_descriptions(read: _Read, coverage: Coverage) -> Iterator[Finding]:
-    """Every image has its description in the telemetry and the other way round; what was not read may have it."""
-    described = Counter(key for key, _ in read.contents.metas)
-    block_ids = {key: meta.block_id for key, meta in read.contents.metas}
-    reported, utc = reported_blocks(read.contents.events), offsets_of(read.contents.events)
-    found = frame_account(read.images, block_ids, described, reported, coverage, read.is_damaged_at)
-    yield from _frames(_missing_part, found.bare, "without a description in the telemetry", utc)
-    yield from _frames(_missing_part, found.gone, "missing, though described in the telemetry", utc)
-    yield from _frames(_note, found.gone_reported, "described but lost by the recorder, as its events say", utc)
-    yield from _frames(
-        _note, found.bare_torn, "without a description, which was lost when the recorder was killed", utc
-    )
-    yield from _frames(_note, found.gone_torn, "described but lost when the recorder was killed", utc)
+def _steps_without_frames(read: _Read, coverage: Coverage) -> Iterator[Finding]:
+    """Every step that is done has its frames; what was not read may have them."""
+    if not all_frames_are_read(coverage) or any(hole.series == FRAMES for hole in coverage.holes):
+        return
+    contents, utc = read.contents, offsets_of(read.contents.events)
+    for short in find_shortages(contents.marks, contents.events, read.metas):
+        frames = "1 frame" if short.missing == 1 else f"{short.missing} frames"
+        steps = short.step_ids[0] if len(short.step_ids) == 1 else f"{short.step_ids[0]} to {short.step_ids[-1]}"
+        which = f"{frames} of {steps}, {utc.date_time(short.begin_ns)} to {utc.local_text(short.end_ns)}"
+        if short.is_reported:
+            yield _note(f"{which}: lost by the recorder, as its events say")
+        elif not read.is_damaged(FRAMES):
+            yield _missing_part(f"{which}: missing, though their steps are done")
 
 
-def _frames(
-    kind: Callable[[str], Finding], keys: Collection[FrameKey], what: str, utc: UtcOffsets
-) -> Iterator[Finding]:
-    """One finding for all frames of a kind."""
-    if keys:
-        times_ns, blocks = sorted(time_ns for time_ns, _ in keys), sorted(block for _, block in keys)
-        if len(keys) == 1:
-            yield kind(f"1 frame is {what}: block {blocks[0]}, {utc.local_text(times_ns[0])}")
-            return
-        yield kind(
-            f"{len(keys)} frames are {what}: blocks {blocks[0]} to {blocks[-1]}, "
-            f"{utc.date_time(times_ns[0])} to {utc.local_text(times_ns[-1])}"
-        )
-
-
-def _frames_lost(contents: Contents) -> Iterator[Finding]:
+def _frames_lost(read: _Read) -> Iterator[Finding]:
     """What the recorder, and what camera and wire lost, as recorded."""
+    contents = read.contents
     utc = offsets_of(contents.events)
     for event in contents.events:
         if event.kind == FRAMES_DROPPED:
             yield _note(f"{utc.local_text(event.time_ns)}: {event.text}")
     dropped: Counter[str] = Counter()
-    for _, meta in contents.metas:
+    for meta in read.metas:
         dropped[meta.step_id] += meta.dropped
     steps = {mark.step_id: f"step {mark.index + 1} ({mark.kind})" for mark in contents.marks}
     for step_id, count in dropped.items():
@@ -367,8 +346,8 @@ def _frames_lost(contents: Contents) -> Iterator[Finding]:
             yield _note(f"{lost} of {steps.get(step_id, 'no step')} lost by the camera or its wire")
 
 
-def _camera_temperature(contents: Contents) -> Iterator[Finding]:
-    if has_temperature(meta for _, meta in contents.metas) is False:
+def _camera_temperature(read: _Read) -> Iterator[Finding]:
+    if has_temperature(read.metas) is False:
         yield _note(f"{NO_TEMPERATURE}: no drift over temperature can be fitted to them")
 
 

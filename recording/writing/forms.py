@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import CompressionType
 
 from thermostand.foundation.clock import seconds_ns
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS
+from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.recording.writing.segment import SeriesForm, Topic
@@ -27,18 +28,20 @@ class SessionForm:
     settings: RecordingSettings
 
     def frames(self) -> SeriesForm:
-        """Of the frames: PNG does not shrink further, and raw frames are chosen for speed."""
+        """Of the frames: raw ones are chosen for speed."""
         settings = self.settings
         return SeriesForm(
             FRAMES,
-            (Topic(CAMERA_IMAGE, IMAGE_CLASS[settings.frame_encoding]),),
-            CompressionType.NONE,
+            frames_topics(self.devices),
+            CompressionType.NONE if settings.frame_encoding == "raw" else CompressionType.ZSTD,
             self.metadata,
             self.attachments,
             settings.segment_bytes,
             seconds_ns(settings.segment_s),
             reserve_bytes=settings.segment_bytes,
             keep_free_bytes=settings.stop_frames_below_bytes,
+            topic_of=frames_topic,
+            level=ZSTD_LEVEL,
         )
 
     def telemetry(self) -> SeriesForm:
@@ -61,6 +64,17 @@ def telemetry_topics(devices: Mapping[str, str]) -> tuple[Topic, ...]:
     kinds = set(devices.values())
     names = [kind.topic for name, kind in messages.KINDS.items() if name in kinds]
     names += [messages.TABLE_POSE] * ("axis" in kinds) + [messages.ORIGINAL] * ("imager" in kinds)
-    names += [messages.CAMERA_META, messages.STEP, messages.EVENT, messages.LOG]
+    names += [messages.STEP, messages.EVENT, messages.LOG]
     on = {name: tuple(each for each, kind in devices.items() if messages.KINDS[kind].topic == name) for name in names}
     return tuple(Topic(name, messages.CLASSES[name], on[name]) for name in names)
+
+
+def frames_topics(devices: Mapping[str, str]) -> tuple[Topic, ...]:
+    """Of the cameras among these devices; one that is not among them gets its topics with its first frame."""
+    cameras = [name for name, kind in devices.items() if kind == "camera"]
+    return tuple(frames_topic(name) for camera in cameras for name in frame_topics(f"{camera}.image"))
+
+
+def frames_topic(name: str) -> Topic:
+    """The topic of that name (images.FrameTopics)."""
+    return Topic(name, messages.FRAME_META_CLASS if name.endswith("/meta") else RawImage)

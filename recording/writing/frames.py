@@ -7,17 +7,24 @@ that is nearly full is left to the telemetry. A frame whose folder has gone wait
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from enum import Enum
-
-import cv2  # noqa: F401  # pyright: ignore[reportUnusedImport] - here, so that no frame waits for it
+from typing import NamedTuple
 
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock
-from thermostand.foundation.items import Event, Item
-from thermostand.foundation.readings import Frame
-from thermostand.recording.format.images import CAMERA_IMAGE, encode_image
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
+from thermostand.foundation.readings import Frame, Reading
+from thermostand.recording.format.images import (
+    Circumstances,
+    encode_image,
+    encode_meta,
+    frame_topics,
+    last_readings,
+)
 from thermostand.recording.format.layout import FRAMES, SEQUENCE_MASK
+from thermostand.recording.format.messages import decode_frame_meta
 from thermostand.recording.format.restarts import restarted_step
 from thermostand.recording.writing.home import FolderLost
 from thermostand.recording.writing.homes import Homes, Kept
@@ -30,24 +37,74 @@ from thermostand.recording.writing.waiting import Waiting
 _OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
 
 
+class Published(NamedTuple):
+    """A frame, and what was known then."""
+
+    frame: Frame
+    known: Circumstances
+
+
+def frame_records(published: Published) -> list[Record]:
+    """The two messages of a frame; one that was recorded before keeps its description. ValueError when its image is
+    none, or a window is not within it."""
+    frame, published_ns = published.frame, published.known.published_ns
+    description = frame.described or encode_meta(frame, published.known)
+    if frame.described:
+        published_ns = decode_frame_meta(description).published_ns
+    meta, image = frame_topics(frame.channel)
+    stamps = frame.block_id & SEQUENCE_MASK, published_ns
+    return [
+        Record(meta, frame.time_ns, description, *stamps),
+        Record(image, frame.time_ns, encode_image(frame), *stamps),
+    ]
+
+
+class Surroundings:
+    """What is known of the stand when a frame is published: its step, and its last temperatures and positions."""
+
+    def __init__(self) -> None:
+        self._steps: dict[str, StepMark] = {}
+        self._readings: dict[str, Reading] = {}
+
+    def receive(self, item: Item) -> None:
+        """One more item of the hub."""
+        if isinstance(item, Batch):
+            self._readings |= {f"{reading.channel} {reading.unit}": reading for reading in last_readings(item.readings)}
+        elif isinstance(item, StepMark) and item.state is StepState.STARTED:
+            self._steps = {item.step_id: item}
+
+    def of(self, frame: Frame, now_ns: int) -> Circumstances:
+        """Of a frame that is published now."""
+        mark = self._steps.get(frame.step_id)
+        parameters = {} if mark is None else mark.parameters
+        degC = parameters.get("chamber_degC")
+        set_point_degC = float(degC) if isinstance(degC, int | float) else math.nan
+        return Circumstances(
+            now_ns,
+            str(parameters.get("role") or ""),
+            set_point_degC,
+            tuple(self._readings.values()),
+        )
+
+
 class Frames:
     """The frames of one session; `receive` is the hub's subscriber from `begin` on. kept: what their folder holds of
-    this run. `encode` makes an image message, in a thread of its own and in order of the frames."""
+    this run. `prepare` gives what of a frame is recorded, in a thread of its own and in order of the frames."""
 
     def __init__(
         self,
         settings: RecordingSettings,
-        encode: Callable[[Frame], bytes] | None,
+        prepare: Callable[[Frame], Frame] | None,
         clock: Clock,
         waiting: Waiting,
         homes: Homes,
     ) -> None:
-        self._settings = settings
-        self._encode = encode or self._encode_alone
+        self._prepare = prepare or _as_it_is
+        self._surroundings = Surroundings()
         self._clock = clock
         self._waiting = waiting
         self._homes = homes
-        self._queue: asyncio.Queue[Frame] = asyncio.Queue(settings.queue_frames)
+        self._queue: asyncio.Queue[Published] = asyncio.Queue(settings.queue_frames)
         self._taking = False
         self.losses = Losses()
         self.taken = 0
@@ -56,7 +113,7 @@ class Frames:
         """Take what is published, into this series."""
         self.series = series
         self.lane = Lane("record-frames", self._clock, patient=False)
-        self._writer = ImageWriter(series, self._encode, self.losses)
+        self._writer = FrameWriter(series, self._prepare, self.losses)
         self.kept = Kept(self._clock.now_ns(), 0)
         self._taking = True
 
@@ -75,19 +132,17 @@ class Frames:
         """In the queue."""
         return self._queue.qsize()
 
-    def _encode_alone(self, frame: Frame) -> bytes:
-        return encode_image(frame, self._settings.frame_encoding)
-
     def receive(self, item: Item) -> None:
         """Queue a frame, or count it as lost when there is no room."""
         if not self._taking:
             return
+        self._surroundings.receive(item)
         if isinstance(item, Event) and (step_id := restarted_step(item)):
             self.losses.supersede(step_id, item.time_ns)
         if isinstance(item, Frame):
             now_ns = self._clock.now_ns()
             try:
-                self._queue.put_nowait(item)
+                self._queue.put_nowait(Published(item, self._surroundings.of(item, now_ns)))
             except asyncio.QueueFull:
                 self.losses.count(item, "the disk did not take them in time")
                 self._waiting.frame_refused(now_ns)
@@ -143,39 +198,44 @@ class Fate(Enum):
     HOMELESS = "homeless"
 
 
-class ImageWriter:
+def _as_it_is(frame: Frame) -> Frame:
+    return frame
+
+
+class FrameWriter:
     """Encodes and commits frames one by one. `done` frames are `saved` or counted as lost."""
 
-    def __init__(self, series: DiskSeries, encode: Callable[[Frame], bytes], losses: Losses) -> None:
+    def __init__(self, series: DiskSeries, prepare: Callable[[Frame], Frame], losses: Losses) -> None:
         self._series = series
-        self._encode = encode
+        self._prepare = prepare
         self._losses = losses
         self._block_bytes = 0  # of the last frame that was offered to the disk
-        self.homeless: Frame | None = None  # found its folder gone; it is the first to be saved again
+        self.homeless: Published | None = None  # found its folder gone; it is the first to be saved again
         self.saved = 0
         self.done = 0
 
-    def save(self, frame: Frame) -> tuple[Fate, str]:
+    def save(self, published: Published) -> tuple[Fate, str]:
         """The frame on the disk; or why it is not, and it is counted as lost: the disk refuses it twice, it is nearly
         full, or the frame cannot be encoded. One whose folder is gone is not lost."""
-        fate, reason = self._fate(frame)
-        self.homeless = frame if fate is Fate.HOMELESS else None
+        fate, reason = self._fate(published)
+        self.homeless = published if fate is Fate.HOMELESS else None
         if self.homeless is not None:
             return fate, reason
         if fate is Fate.SAVED:
             self.saved += 1
         else:
-            self._losses.count(frame, reason)
+            self._losses.count(published.frame, reason)
         self.done += 1
         return fate, reason
 
-    def give_up(self, frame: Frame, reason: str) -> None:
+    def give_up(self, published: Published, reason: str) -> None:
         """A frame that found no folder to the end."""
         self.homeless = None
-        self._losses.count(frame, reason)
+        self._losses.count(published.frame, reason)
         self.done += 1
 
-    def _fate(self, frame: Frame) -> tuple[Fate, str]:
+    def _fate(self, published: Published) -> tuple[Fate, str]:
+        frame = published.frame
         try:
             self._series.finish_full(frame.time_ns)
             if not self._series.is_open:
@@ -183,11 +243,9 @@ class ImageWriter:
             if (space := self._series.space.last).frames_stopped:
                 self._series.finish()  # for as long as that takes nothing is left open, or reserved
                 return Fate.LOST, space.stop_reason
-            data = self._encode(frame)
-            self._block_bytes = len(data)
-            self._series.commit(
-                [Record(CAMERA_IMAGE, frame.time_ns, data, frame.block_id & SEQUENCE_MASK)], frame.time_ns
-            )
+            records = frame_records(published._replace(frame=self._prepare(frame)))
+            self._block_bytes = sum(len(record.data) for record in records)
+            self._series.commit(records, frame.time_ns)
         except FolderLost as error:
             return Fate.HOMELESS, str(error.strerror)
         except OSError as error:

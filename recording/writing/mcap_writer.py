@@ -45,7 +45,7 @@ _COMPRESSION_NAMES = {CompressionType.NONE: "", CompressionType.ZSTD: "zstd"}
 class _Chunk:
     """The chunk in progress. places: of its messages, (log time, offset) by channel."""
 
-    parts: list[bytes] = field(default_factory=list[bytes])
+    parts: list[bytes | memoryview] = field(default_factory=list[bytes | memoryview])
     size_bytes: int = 0
     first_ns: int = 0
     last_ns: int = 0
@@ -60,12 +60,13 @@ class _Chunk:
 
 class McapWriter:
     """The records of one file, in blocks that `take` hands over. A chunk ends at `end_chunk`, or when it has more than
-    `chunk_bytes`; one without a message is not written."""
+    `chunk_bytes`; one without a message is not written. level: of zstd."""
 
-    def __init__(self, compression: CompressionType, chunk_bytes: int) -> None:
+    def __init__(self, compression: CompressionType, chunk_bytes: int, level: int = 3) -> None:
         self._compression = compression
+        self._level = level
         self._chunk_bytes = chunk_bytes
-        self._parts: list[bytes] = []
+        self._parts: list[bytes | memoryview] = []
         self._written_bytes = 0
         self._chunk = _Chunk()
         self._schemas: list[Schema] = []
@@ -78,7 +79,7 @@ class McapWriter:
         self._write(MCAP0_MAGIC)
         self._write(bytes_of(Header("", LIBRARY_IDENTIFIER)))
 
-    def take(self) -> list[bytes]:
+    def take(self) -> list[bytes | memoryview]:
         """The parts since the last time, one behind the other; the chunk in progress is not among them."""
         parts, self._parts = self._parts, []
         return parts
@@ -118,7 +119,9 @@ class McapWriter:
         self._add(bytes_of(self._channels[-1]))
         return number
 
-    def add_message(self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
+    def add_message(
+        self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes | memoryview
+    ) -> None:
         """`data` is not to be changed any more."""
         self._first_ns = min(self._first_ns, log_time_ns) if self._counts else log_time_ns
         self._last_ns = max(self._last_ns, log_time_ns)
@@ -134,12 +137,11 @@ class McapWriter:
             return
         self._chunk = _Chunk()
         name = _COMPRESSION_NAMES[self._compression]
-        parts = [b"".join(chunk.parts)] if name else chunk.parts
-        crc = 0
+        parts, crc = chunk.parts, 0
         for part in parts:
             crc = deflate.crc32(part, crc)
         if name:
-            parts = [zstandard.compress(parts[0])]
+            parts = [zstandard.compress(b"".join(parts), self._level)]
         stored_bytes = sum(map(len, parts))
         head = CHUNK.pack(chunk.first_ns, chunk.last_ns, chunk.size_bytes, crc, len(name)) + name.encode()
         head += LENGTH.pack(stored_bytes)
@@ -201,14 +203,14 @@ class McapWriter:
             (Opcode.METADATA_INDEX, [*self._metadata_indexes]),
         ]
 
-    def _add(self, *parts: bytes) -> None:
+    def _add(self, *parts: bytes | memoryview) -> None:
         chunk = self._chunk
         chunk.parts += parts
         chunk.size_bytes += sum(map(len, parts))
         if chunk.size_bytes > self._chunk_bytes:
             self.end_chunk()
 
-    def _write(self, *parts: bytes) -> tuple[int, int]:
+    def _write(self, *parts: bytes | memoryview) -> tuple[int, int]:
         """Where they begin, and their length."""
         begin = self._written_bytes
         self._parts += parts

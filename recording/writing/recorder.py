@@ -26,7 +26,6 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
-from thermostand.recording.format.decoded_items import Description
 from thermostand.recording.writing.disk import Disk
 from thermostand.recording.writing.forms import SessionForm
 from thermostand.recording.writing.frames import Frames
@@ -53,9 +52,8 @@ class Recorder:
     """Records from `start` to `finish`; `run` does the work between and is cancelled before `finish`.
 
     `directory` gets the folders `frames` and `telemetry`; a directory with segments of an earlier run is continued.
-    `encode` makes an image message of the settings' encoding, in a thread of its own and in order of the frames; by
-    default each by itself. `disk` is the process that touches the disk; without one this process does.
-    """
+    `prepare` gives what of a frame is recorded, in a thread of its own and in order of the frames. `disk` is the
+    process that touches the disk; without one this process does."""
 
     def __init__(
         self,
@@ -66,7 +64,7 @@ class Recorder:
         hub: Hub,
         clock: Clock,
         settings: RecordingSettings = USUAL,
-        encode: Callable[[Frame], bytes] | None = None,
+        prepare: Callable[[Frame], Frame] | None = None,
         disk: Disk | None = None,
     ) -> None:
         self.directory = directory
@@ -79,7 +77,7 @@ class Recorder:
         self._notices: deque[Event] = deque()  # from any thread
         tell = self._notices.append
         self._homes = Homes(directory, tell)
-        self._frames = Frames(settings, encode, clock, self._waiting, self._homes)
+        self._frames = Frames(settings, prepare, clock, self._waiting, self._homes)
         self._telemetry = Telemetry(directory, devices, settings, clock, self._waiting, self._homes, tell)
         self._finishing: asyncio.Future[None] | None = None
 
@@ -216,7 +214,6 @@ class Recorder:
                 stack.callback(self._report)
                 stack.push_async_callback(frames.lane.call, frames.series.finish)
                 await frames.finish()
-                telemetry.takes_frames = False
         except TimeoutError as error:
             raise SessionError(
                 f"{self.directory}: the disk has not answered in time; the session is unfinished, {frames.waiting} "
@@ -227,10 +224,6 @@ class Recorder:
     def tell(self, kind: EventKind, said: str) -> None:
         """An event of this kind with the next report; from any thread."""
         self._notices.append(kind.at(0, said))
-
-    def keep_description(self, description: Description) -> None:
-        """A frame's description without its image, as the copy of a session that lost that image has it."""
-        self._telemetry.keep(description)
 
     async def _on_ticks(self, work: Callable[[int], Awaitable[None]]) -> None:
         """At each instant at which the telemetry is committed."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self
 
-from thermostand.recording.format.images import ImageEncoding
+from thermostand.recording.format.images import FrameEncoding
 from thermostand.recording.format.layout import FORMAT
 
 _NOT_EMPTY = ("extent", "holes")  # left out of the record when they are
@@ -59,7 +59,7 @@ class RecordingSettings:
     With less than `stop_frames_below_bytes` free on the disk no frames are recorded, so that telemetry can continue;
     with less than `alert_below_fraction` of the disk free there is a warning."""
 
-    frame_encoding: ImageEncoding = "png"
+    frame_encoding: FrameEncoding = "zstd"
     telemetry_commit_s: float = 1.0
     segment_bytes: int = 1_000_000_000
     segment_s: float = 600.0

@@ -17,7 +17,7 @@ import ctypes
 import errno
 import fcntl
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,9 +32,11 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from thermostand.foundation.files import sync_folder
 from thermostand.recording.format.damage import DAMAGE
+from thermostand.recording.format.images import META_SCHEMA
 from thermostand.recording.format.layout import (
     DEVICES,
     FINISHED,
+    FRAME_TABLE,
     SEGMENT_METADATA,
     SESSION_METADATA,
     TEMPORARY,
@@ -42,6 +44,7 @@ from thermostand.recording.format.layout import (
     segment_metadata,
 )
 from thermostand.recording.format.mcap_bytes import MESSAGE, RECORD, check_attachment, chunk_content, records, stream
+from thermostand.recording.format.messages import frame_table
 from thermostand.recording.writing.mcap_writer import McapWriter
 from thermostand.recording.writing.notices import disk_space
 
@@ -60,12 +63,13 @@ _libc.sync_file_range.argtypes = (ctypes.c_int, ctypes.c_int64, ctypes.c_int64, 
 
 
 class Record(NamedTuple):
-    """One encoded message; log and publish time are both `time_ns`."""
+    """One encoded message; time_ns is its log time, and its publish time unless that is given."""
 
     topic: str
     time_ns: int
-    data: bytes
+    data: bytes | memoryview
     sequence: int = 0
+    published_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +87,7 @@ class SeriesForm:
 
     A segment is full at `segment_bytes` or `segment_ns`. `reserve_bytes` of the disk are allocated when it is opened,
     less where that would leave less than `keep_free_bytes`. `merge_chunks`: a finished segment of many small chunks
-    is rewritten with large ones.
+    is rewritten with large ones. topic_of: gives the topic of a name that is not among `topics`. level: of zstd.
     """
 
     name: str
@@ -96,6 +100,8 @@ class SeriesForm:
     reserve_bytes: int = 0
     keep_free_bytes: int = 0
     merge_chunks: bool = False
+    topic_of: Callable[[str], Topic] | None = None
+    level: int = 3
 
 
 class CommitSink:
@@ -123,7 +129,7 @@ class CommitSink:
         """What is still reserved behind the committed blocks."""
         return max(0, self._reserve_bytes - self.committed_bytes)
 
-    def append(self, parts: Sequence[bytes]) -> None:
+    def append(self, parts: Sequence[bytes | memoryview]) -> None:
         """Write and sync one block, given in parts; on OSError it is cut off again, if the disk allows that much, and
         the error raised."""
         try:
@@ -152,6 +158,32 @@ class CommitSink:
                 os.close(fd)
 
 
+class FrameTable:
+    """The descriptions of a segment's frames once more, behind the last one: who lists them decompresses no image."""
+
+    def __init__(self, writer: McapWriter) -> None:
+        self._writer = writer
+        self._channels: set[int] = set()
+        self._descriptions: list[bytes] = []
+
+    def know(self, channel: int, schema: str) -> None:
+        """A channel with messages of that schema."""
+        if schema == META_SCHEMA:
+            self._channels.add(channel)
+
+    def note(self, channel: int, data: bytes | memoryview) -> None:
+        """A message, of which those that describe a frame are kept."""
+        if channel in self._channels:
+            self._descriptions.append(bytes(data))
+
+    def write(self, time_ns: int) -> None:
+        """The table, when there is a frame: nothing is added any more."""
+        if self._descriptions:
+            self._writer.end_chunk()
+            table = frame_table(self._descriptions)
+            self._writer.add_attachment(Attachment(0, time_ns, FRAME_TABLE, "application/x-protobuf", table))
+
+
 class Segment:
     """One file of a series, from creation to finish; after an OSError of any method only `abandon` is left."""
 
@@ -159,9 +191,11 @@ class Segment:
         self.begun_ns = time_ns
         self.number = number
         self._form = form
+        self._schemas: dict[str, int] = {}  # number by name
         self._part = folder / f"{number:04d}{UNFINISHED}"
         self._finished = folder / f"{number:04d}{FINISHED}"
-        self._writer = McapWriter(form.compression, CHUNK_BYTES)
+        self._writer = McapWriter(form.compression, CHUNK_BYTES, form.level)
+        self._table = FrameTable(self._writer)
         self._chunk_count = 0
         self._sink = CommitSink(self._part, _affordable_bytes(folder, form))
         try:
@@ -184,16 +218,30 @@ class Segment:
         return {topic.name: self._register(topic) for topic in self._form.topics}
 
     def _register(self, topic: Topic) -> int:
-        files = build_file_descriptor_set(topic.message).SerializeToString()
-        schema = self._writer.add_schema(topic.message.DESCRIPTOR.full_name, SchemaEncoding.Protobuf, files)
+        name = topic.message.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            files = build_file_descriptor_set(topic.message).SerializeToString()
+            self._schemas[name] = self._writer.add_schema(name, SchemaEncoding.Protobuf, files)
         devices = {DEVICES: ",".join(topic.devices)} if topic.devices else {}
-        return self._writer.add_channel(topic.name, MessageEncoding.Protobuf, schema, devices)
+        channel = self._writer.add_channel(topic.name, MessageEncoding.Protobuf, self._schemas[name], devices)
+        self._table.know(channel, name)
+        return channel
+
+    def _late(self, name: str) -> int:
+        """A topic that is first written to now; KeyError when the series has none of that name."""
+        if self._form.topic_of is None:
+            raise KeyError(name)
+        return self._register(self._form.topic_of(name))
 
     def commit(self, records: Iterable[Record]) -> None:
         """All of `records` on the disk when this returns."""
         for record in records:
-            time_ns = record.time_ns
-            self._writer.add_message(self._channels[record.topic], time_ns, time_ns, record.sequence, record.data)
+            time_ns, published_ns = record.time_ns, record.published_ns or record.time_ns
+            channel = self._channels.get(record.topic)
+            if channel is None:
+                channel = self._channels[record.topic] = self._late(record.topic)
+            self._writer.add_message(channel, time_ns, published_ns, record.sequence, record.data)
+            self._table.note(channel, record.data)
         self._writer.end_chunk()
         self._sink.append(self._writer.take())
         self._chunk_count += 1
@@ -215,6 +263,7 @@ class Segment:
 
     def finish(self) -> None:
         """Index, sync, rename: the segment is complete and stays so. It is locked until it has its final name."""
+        self._table.write(self.begun_ns)
         self._writer.finish()
         self._sink.append(self._writer.take())
         self._sink.settle()
@@ -337,7 +386,7 @@ def _reserve(fd: int, size_bytes: int) -> None:
             raise OSError(number, f"{os.strerror(number)} (to reserve {size_bytes / 1e6:.0f} MB)")
 
 
-def _write(fd: int, parts: Sequence[bytes], offset: int) -> int:
+def _write(fd: int, parts: Sequence[bytes | memoryview], offset: int) -> int:
     """Write all parts, one behind the other, from `offset`; returns where they end. The disk begins with a piece while
     the next one is copied: a frame that is handed over at once waits for the copy of all of it first."""
     for piece in _pieces(parts):
@@ -354,7 +403,7 @@ def _write(fd: int, parts: Sequence[bytes], offset: int) -> int:
     return offset
 
 
-def _pieces(parts: Sequence[bytes]) -> Iterator[list[memoryview]]:
+def _pieces(parts: Sequence[bytes | memoryview]) -> Iterator[list[memoryview]]:
     """The parts' bytes in their order, in pieces of at most _PIECE_BYTES and _PARTS_AT_ONCE parts."""
     piece: list[memoryview] = []
     room = _PIECE_BYTES

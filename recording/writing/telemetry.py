@@ -1,4 +1,4 @@
-"""Readings, events and what belongs to a frame beside its image: from the hub to the disk, committed on ticks.
+"""Readings, steps and events: from the hub to the disk, committed on ticks.
 
 What is published waits in memory until it is on the disk; when that holds too much, readings are the first to go. They
 are encoded and committed by a lane's thread, off the loop.
@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from google.protobuf.message import Message
 
 from thermostand.foundation.calls import Lane
@@ -19,11 +17,10 @@ from thermostand.foundation.clock import Clock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import TELEMETRY_NOT_SAVED, TELEMETRY_SAVED_AGAIN
 from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
-from thermostand.foundation.readings import Frame, Quality, Reading
+from thermostand.foundation.readings import Frame, Quality
 from thermostand.recording.format import messages
-from thermostand.recording.format.decoded_items import Description, UndescribedFrame
 from thermostand.recording.format.kinds import KINDS, Kind
-from thermostand.recording.format.layout import SEQUENCE_MASK, TELEMETRY
+from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.writing.homes import Homes, Kept
 from thermostand.recording.writing.notices import DroppedReadings
 from thermostand.recording.writing.recorder_settings import RecordingSettings
@@ -31,14 +28,12 @@ from thermostand.recording.writing.segment import Record
 from thermostand.recording.writing.series import DiskSeries
 from thermostand.recording.writing.waiting import Waiting
 
-NO_IMAGE = np.empty((0, 0), np.uint8)
 PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second
 
 
 class Telemetry:
     """The telemetry of one session; `receive` is the hub's subscriber from `begin` on. taking: until the
-    end of the recording. takes_frames: whether frames are being recorded, whose descriptions are telemetry. kept: what
-    its folder holds of this run."""
+    end of the recording. kept: what its folder holds of this run."""
 
     def __init__(
         self,
@@ -57,9 +52,9 @@ class Telemetry:
         self._waiting = waiting
         self._homes = homes
         self._tell = tell
-        self._items: list[Item | Description] = []  # since the last commit
+        self._items: list[Item] = []  # since the last commit
         self._dropped = DroppedReadings()
-        self._is_failing = self.taking = self.takes_frames = False
+        self._is_failing = self.taking = False
         self.items_taken = 0
 
     def begin(self, series: DiskSeries) -> None:
@@ -68,7 +63,7 @@ class Telemetry:
         self.lane = Lane("record-telemetry", self._clock, patient=False)
         self._writer = TelemetryWriter(series, self._encoder)
         self.kept = Kept(self._clock.now_ns(), 0)
-        self.taking = self.takes_frames = True
+        self.taking = True
 
     @property
     def items_saved(self) -> int:
@@ -88,24 +83,15 @@ class Telemetry:
     def receive(self, item: Item) -> None:
         """Keep the item for the next commit, or count what does not fit; ValueError for a batch of a device that was
         not declared."""
-        if not self.taking:
+        if not self.taking or isinstance(item, Frame):
             return
         self._encoder.check(item)
-        if isinstance(item, Frame):
-            if not self.takes_frames:
-                return
-            item = replace(item, image=NO_IMAGE)  # the image itself waits in one place only
         if isinstance(item, Batch) and self.messages_waiting >= self._most_waiting:
             self._dropped.count(item, self._tell)
             return
-        self.keep(item)
-
-    def keep(self, item: Item | Description) -> None:
-        """For the next commit, in any case but when the recording has ended."""
-        if self.taking:
-            self._items.append(item)
-            self.items_taken += 1
-            self._waiting.item_published(self._clock.now_ns())
+        self._items.append(item)
+        self.items_taken += 1
+        self._waiting.item_published(self._clock.now_ns())
 
     async def save(self) -> OSError | None:
         """Commit what was published since the last time and what failed before; the error when the disk refuses."""
@@ -151,22 +137,16 @@ class TelemetryEncoder:
         if isinstance(item, Batch) and item.device not in self._encoders:
             raise ValueError(f"{item.device} is not among the recorded devices {', '.join(self._encoders)}")
 
-    def encode(self, item: Item | Description) -> Iterator[Record]:
-        """The item's records, most often one."""
+    def encode(self, item: Item) -> Iterator[Record]:
+        """The item's records, most often one; a frame has none."""
         match item:
             case Batch():
                 encoder = self._encoders[item.device]
                 yield Record(encoder.topic, item.time_ns, encoder.encode(item))
                 if self._devices[item.device] == "axis":
                     yield from self._pose(item)
-            case Description():
-                yield Record(messages.CAMERA_META, item.time_ns, item.data, item.sequence)
-            case UndescribedFrame():
-                pass  # a description is never invented
             case Frame():
-                yield Record(
-                    messages.CAMERA_META, item.time_ns, messages.encode_frame_meta(item), item.block_id & SEQUENCE_MASK
-                )
+                pass
             case Original():
                 yield Record(messages.ORIGINAL, item.time_ns, messages.encode_original(item))
             case StepMark():
@@ -212,22 +192,10 @@ class BatchEncoder:
                 fields[names[0]] = value if value == value else math.nan
                 fields[names[1]] = messages.QUALITY_NUMBER[reading.quality]
             if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
-                remarks.append(_remark(reading))
+                remarks.append(messages.remark_of(reading))
         if remarks:
             fields["remarks"] = remarks
         return self._class(**fields).SerializeToString()
-
-
-def _remark(reading: Reading) -> Message:
-    return messages.REMARK_CLASS(
-        channel=reading.channel,
-        value=messages.canonical(reading.value),
-        unit=reading.unit,
-        time_ns=reading.time_ns,
-        quality=messages.QUALITY_NUMBER[reading.quality],
-        reason=reading.reason,
-        cause=reading.cause,
-    )
 
 
 class TelemetryWriter:
@@ -246,7 +214,7 @@ class TelemetryWriter:
         """Messages that are not on the disk yet."""
         return len(self._backlog)
 
-    def save(self, items: Sequence[Item | Description], now_ns: int) -> OSError | None:
+    def save(self, items: Sequence[Item], now_ns: int) -> OSError | None:
         """All items so far on the disk, or why they are not; FolderLost also when there was nothing to write."""
         for item in items:
             self._backlog.extend(self._encoder.encode(item))

@@ -98,16 +98,16 @@ class CompressorConfig(Document):
 class RecordingConfig(Document):
     """Where sessions go, how often telemetry is committed, and what is left of the disk.
 
-    roi keeps the markers' surroundings and a whole frame every `whole_every_s`. With less than `stop_frames_below_GB`
-    free no frame is recorded, with less than `alert_below_percent` of the disk there is a warning. What is published is
-    on the disk within `durable_within_s`, or the stand is made safe. archive_directory: where `stand session archive`
-    copies finished sessions to, another disk. idle_log_days: the daemon's records between runs are removed so many days
-    later, unless they have a note or a tag; 0 keeps them all.
+    zstd compresses frames, raw does not, roi keeps the markers' surroundings and a whole frame every `whole_every_s`.
+    With less than `stop_frames_below_GB` free no frame is recorded, with less than `alert_below_percent` of the disk
+    there is a warning. What is published is on the disk within `durable_within_s`, or the stand is made safe.
+    archive_directory: where `stand session archive` copies finished sessions to, another disk. idle_log_days: the
+    daemon's records between runs are removed so many days later, unless they have a note or a tag; 0 keeps them all.
     """
 
     directory: PrintablePath = Path("sessions")
     archive_directory: PrintablePath | None = None
-    frame_encoding: Literal["png", "raw", "roi"] = "png"
+    frame_encoding: Literal["zstd", "raw", "roi"] = "zstd"
     whole_every_s: float = Field(default=60.0, gt=0, le=86400)
     telemetry_commit_s: float = Field(default=1.0, gt=0, le=1)
     durable_within_s: float = Field(default=60.0, ge=1, le=300)

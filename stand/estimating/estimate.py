@@ -27,9 +27,9 @@ from thermostand.stand.estimating.chamber_model import ChamberModel
 from thermostand.stand.estimating.durations import ConfiguredStand, expect
 from thermostand.stand.estimating.learned import Learned
 
-# Measured on recorded sessions: bytes per pixel of a PNG of the target with shot noise, and of one telemetry message
+# Measured on recorded sessions: bytes per pixel of a frame of the target with shot noise, and of one telemetry message
 # with its share of the index, committed every second.
-_BYTES_PER_PIXEL = {"png": 0.47, "raw": 1.0, "roi": 0.074}
+_BYTES_PER_PIXEL = {"zstd": 0.573, "raw": 1.0, "roi": 0.103}
 _TELEMETRY_BYTES_PER_MESSAGE = 116.0
 _SENSOR_PX = (2448, 2048)
 
@@ -221,7 +221,7 @@ def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
     if isinstance(step, Capture | SoakUntilSettled) and recording.frame_encoding == "roi" and frames:
         interval_s = step.interval_s if isinstance(step, Capture) else step.look_every_s
         whole = min(frames, 1 + int((frames - 1) * interval_s / recording.whole_every_s))
-    return whole * _BYTES_PER_PIXEL["png"] + (frames - whole) * _BYTES_PER_PIXEL[recording.frame_encoding]
+    return whole * _BYTES_PER_PIXEL["zstd"] + (frames - whole) * _BYTES_PER_PIXEL[recording.frame_encoding]
 
 
 def check_step(planned: PlannedStep, stand: KnownStand) -> None:

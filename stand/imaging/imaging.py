@@ -20,8 +20,6 @@ from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
 from thermostand.stand.imaging.camera_supply import CameraSupply
 from thermostand.stand.interlock import Interlock, Motions
 
-_APART_S = 0.001  # between two cameras' frames: an image and its description are found by their instant
-
 
 class Imaging:
     """Flap and cameras; `supply` is theirs."""
@@ -158,20 +156,15 @@ class Imaging:
 async def grab_together(
     cameras: Collection[Camera], clock: Clock, exposure_s: float, due_ns: int = 0
 ) -> tuple[Frame, ...]:
-    """One frame of each, the first at `due_ns` when that is still ahead, the others a little later each. Unreachable
-    when one was lost: then there is a frame of none.
+    """One frame of each, exposed at the same instant, `due_ns` when that is still ahead. Unreachable when one was lost:
+    then there is a frame of none.
 
-    In real time they expose and send together; in virtual time, which stands still meanwhile, one after the other.
+    In real time they expose and send together; in virtual time, which stands still meanwhile, they are asked one after
+    the other.
     """
     if not clock.lead_ns or len(cameras) == 1:
-        frames: list[Frame] = []
-        for camera in cameras:
-            if frames:
-                await clock.sleep_until(clock.now_ns() + seconds_ns(_APART_S))
-            frames.append(await camera.grab(exposure_s, due_ns if not frames else 0))
-        return tuple(frames)
-    first_ns = max(due_ns, clock.now_ns())
-    grabs = (camera.grab(exposure_s, first_ns + number * seconds_ns(_APART_S)) for number, camera in enumerate(cameras))
+        return tuple([await camera.grab(exposure_s, due_ns) for camera in cameras])
+    grabs = (camera.grab(exposure_s, max(due_ns, clock.now_ns())) for camera in cameras)
     results = await asyncio.gather(*grabs, return_exceptions=True)  # each ends: none may be in the wire's lane
     together: list[Frame] = []
     for result in results:

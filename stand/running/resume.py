@@ -130,9 +130,11 @@ def _interruption(
     begun = first if isinstance(first, Begun) else _recorded_begun(session)
     lost = _recorded_end(session, entries)
     items = (*session.steps(), *session.events())
-    all_entries = (*with_recorded(entries, items, _recorded_frames(session)), *lost)
-    _check_may_go_on(directory, folded((), all_entries), clear)
+    without_frames = (*with_recorded(entries, items, ()), *lost)
+    _check_may_go_on(directory, folded((), without_frames), clear)
     order = _order(session, begun)
+    plan = folded(order.recipe.plan(), without_frames).plan
+    all_entries = (*with_recorded(entries, items, _recorded_frames(session, plan)), *lost)
     info = SessionInfo.of(session.metadata)
     config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
     last_ns = max(entries[-1].time_ns, glance(directory).end_ns or 0)
@@ -189,12 +191,19 @@ def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Itera
     return list(merge(sorted(done, key=instant), entries, others, key=instant))
 
 
-def _recorded_frames(session: Session) -> list[tuple[int, str]]:
-    """Instant and step of the captures' frames that are on the disk with their descriptions; looks are none."""
-    times_ns = set(session.frame_times_ns.tolist())
-    captures = {mark.step_id for mark in session.steps() if mark.kind == Capture.kind}
-    metas = ((time_ns, meta.step_id) for time_ns, meta in session.frame_metas if time_ns in times_ns)
-    return [(time_ns, step_id) for time_ns, step_id in metas if step_id in captures]
+def _recorded_frames(session: Session, plan: Iterable[PlannedStep]) -> list[tuple[int, str]]:
+    """Instant and step of the captures' frames that are on the disk; looks are none. Of several cameras those of the
+    one with the fewest: it is the last to have its frame."""
+    metas = session.frame_metas()
+    channels = dict.fromkeys(meta.channel for meta in metas)
+    found: list[tuple[int, str]] = []
+    for planned in plan:
+        if isinstance(planned.step, Capture):
+            of_it = [meta for meta in metas if meta.step_id == planned.step_id]
+            own = [f"{name}.image" for name in planned.step.cameras] or channels
+            taken = [[meta.time_ns for meta in of_it if meta.channel == channel] for channel in own]
+            found += [(time_ns, planned.step_id) for time_ns in min(taken, key=len, default=[])]
+    return found
 
 
 def _recorded_end(session: Session, entries: Sequence[Entry]) -> tuple[Entry, ...]:

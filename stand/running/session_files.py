@@ -18,8 +18,8 @@ from thermostand.foundation.events import ABSENT, SEARCH_FAILED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.markers.target import Target
+from thermostand.recording.format.images import MarkerWindows
 from thermostand.recording.format.kinds import KINDS
-from thermostand.recording.format.roi import RoiEncoder
 from thermostand.recording.writing.disk import Disk
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
@@ -72,11 +72,11 @@ def recorder_of(
     order: Order, directory: Path, info: SessionInfo, assembly: Assembly, disk: Disk | None = None
 ) -> Recorder:
     """The recorder of this run; `disk` is the process that touches the disk for it."""
-    encode = _partial_frames(order)
+    windows = _partial_frames(order)
     attachments, hub, clock = order.attachments(), assembly.hub, assembly.clock
-    recorder = recorder_in(directory, info, attachments, order.config, hub, clock, disk, encode)
-    if encode is not None:
-        encode.tell = partial(recorder.tell, SEARCH_FAILED)
+    recorder = recorder_in(directory, info, attachments, order.config, hub, clock, disk, windows)
+    if windows is not None:
+        windows.tell = partial(recorder.tell, SEARCH_FAILED)
     return recorder
 
 
@@ -88,18 +88,17 @@ def recorder_in(
     hub: Hub,
     clock: Clock,
     disk: Disk | None = None,
-    encode: RoiEncoder | None = None,
+    windows: MarkerWindows | None = None,
 ) -> Recorder:
-    """A recorder with the stand's settings. `roi` frames need `encode`; without it they are whole."""
-    encoding = config.recording.frame_encoding
+    """A recorder with the stand's settings. `roi` frames need `windows`; without them they are whole."""
     settings = RecordingSettings(
-        "png" if encoding == "roi" and encode is None else encoding,
+        config.recording.frame_encoding,
         _commit_s(config.recording, clock),
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
     kinds = {name: kind if kind in KINDS else "relays" for name, kind in device_kinds(config).items()}
-    return Recorder(directory, info, attachments, kinds, hub, clock, settings, encode, disk)
+    return Recorder(directory, info, attachments, kinds, hub, clock, settings, windows, disk)
 
 
 def _commit_s(recording: RecordingConfig, clock: Clock) -> float:
@@ -109,8 +108,8 @@ def _commit_s(recording: RecordingConfig, clock: Clock) -> float:
     return min(recording.telemetry_commit_s, recording.durable_within_s / 3)
 
 
-def _partial_frames(order: Order) -> RoiEncoder | None:
-    """For `roi`: the encoder that keeps the surroundings of the target's markers."""
+def _partial_frames(order: Order) -> MarkerWindows | None:
+    """For `roi`: what keeps the surroundings of the target's markers."""
     recording = order.config.recording
     if recording.frame_encoding != "roi":
         return None
@@ -119,4 +118,4 @@ def _partial_frames(order: Order) -> RoiEncoder | None:
         marker_windows,
     )  # scipy takes half a second that other runs need not wait for
 
-    return RoiEncoder(partial(marker_windows, target=target), recording.whole_every_s)
+    return MarkerWindows(partial(marker_windows, target=target), recording.whole_every_s)

@@ -1,8 +1,8 @@
-"""What an image costs as a message: processor time and size, beside OpenCV's defaults and the entropy of the noise.
+"""What a frame costs as a chunk: processor time and size, beside OpenCV's PNG and the entropy of the noise.
 
-The frames are 5 MP of the target in uneven light with Gaussian noise of a known sigma. No lossless codec can spend less
-than the entropy of the rounded noise, even if it knew the noise-free image. Times are of the processor, so that other
-programs of the machine count less; OpenCV has one thread.
+The frames are 5 MP of the target in uneven light with Gaussian noise of a known sigma, and one of the simulator's. No
+lossless codec can spend less than the entropy of the rounded noise, even if it knew the noise-free image. Times are of
+the processor, so that other programs of the machine count less; OpenCV has one thread.
 """
 
 from __future__ import annotations
@@ -16,26 +16,30 @@ from typing import Any
 
 import cv2
 import numpy as np
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, absolute, at_most, in_turns, progress, ratio_at_least, side_by_side
+from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side
 from tests.compensation.rendered import Scene, render, shaded_light
-from thermostand.compensation.finding.png_rows import decode_rows
+from tests.recording.stored import stored
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.physics.scene import Scene as SimulatedScene
+from thermostand.drivers.sim.physics.scene import SceneSpec
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.readings import Frame
-from thermostand.markers.detection import detect, rows_to_follow
 from thermostand.markers.target import load_target
 from thermostand.markers.windows import marker_windows
-from thermostand.recording.format.images import IMAGE_CLASS, decode_image, encode_image
-from thermostand.recording.format.roi import RoiEncoder
+from thermostand.recording.format.images import ZSTD_LEVEL, ImageArray, MarkerWindows, decode_image
+from thermostand.recording.format.mcap_bytes import LENGTH, RECORD, chunk_content
+from thermostand.recording.format.records import frame_messages
+from thermostand.recording.writing.mcap_writer import McapWriter
+from thermostand.recording.writing.segment import CHUNK_BYTES
 from thermostand.stand.config.stand_config import packaged
 
 ROUNDS = 11
 START_NS = 1_767_290_400 * NS_PER_S
 SIGMAS_DN = (1.0, 1.5, 2.0)
 SIGMAS_12_BIT_DN = (3.0, 24.0)  # the second is 1.5 DN of 8 bit
-PNG = IMAGE_CLASS["png"].DESCRIPTOR.full_name
 LIMIT = "entropy of the noise"
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -43,16 +47,19 @@ Float = NDArray[np.float64]
 
 
 def figures(directory: Path) -> list[Figure]:
-    """ms and ratios of PNG at 8 and 12 bit, and of the windows around the markers."""
+    """ms and ratios of frames of 8 and 12 bit, and of the windows around the markers."""
     progress("codec, rendering the frames")
     clean = render(Scene(ground_DN=170.0, light=shaded_light))
-    image = noisy(clean, 1.5, np.uint8, 1)
+    simulated = SimulatedScene(SceneSpec(), 1).render(
+        Plant(PlantSpec(), START_NS).optics(START_NS), START_NS, 0.1, 0, 1
+    )
     with _one_thread():
         return [
-            *_png(image),
-            *(_of_limit("png, 8 bit", noisy(clean, sigma_DN, np.uint8, 1), sigma_DN) for sigma_DN in SIGMAS_DN),
-            _of_filter(image),
-            *_twelve_bit(clean * 16),
+            *_costs("8 bit", noisy(clean, 1.5, np.uint8, 1)),
+            *_costs("8 bit of the demo", simulated),
+            *_costs("12 bit, noise 24 DN", noisy(clean * 16, 24.0, np.uint16, 1)),
+            *(_of_limit("8 bit", noisy(clean, sigma_DN, np.uint8, 1), sigma_DN) for sigma_DN in SIGMAS_DN),
+            *(_of_limit("12 bit", noisy(clean * 16, sigma, np.uint16, 1), sigma) for sigma in SIGMAS_12_BIT_DN),
             *_roi(clean),
         ]
 
@@ -72,103 +79,65 @@ def rounded_noise_bit(sigma_DN: float) -> float:
     return -sum(part * math.log2(part) for part in np.diff(edges).tolist() if part > 0)
 
 
-def _png(image: Image) -> list[Figure]:
-    progress("codec, 8 bit")
-    data = encode_image(_frame(image), "png")
-    png = cv2.imencode(".png", image)[1]
-    encoded = in_turns(
-        lambda: _cpu_ms(lambda: encode_image(_frame(image), "png")),
-        lambda: _cpu_ms(lambda: cv2.imencode(".png", image)),
-        ROUNDS,
+def chunk_of(frame: Frame) -> bytes:
+    """The frame as the recorder's chunk, with what stands behind it."""
+    writer = McapWriter(CompressionType.ZSTD, CHUNK_BYTES, ZSTD_LEVEL)
+    writer.take()
+    for number, record in enumerate(stored(frame), 1):
+        writer.add_message(number, record.time_ns, record.published_ns, record.sequence, record.data)
+    writer.end_chunk()
+    return b"".join(writer.take())
+
+
+def image_in(chunk: bytes) -> ImageArray:
+    """The image in it, its CRC checked."""
+    (length,) = LENGTH.unpack_from(chunk, 1)
+    _, data = chunk_content(memoryview(chunk)[RECORD.size : RECORD.size + length])
+    return decode_image(frame_messages(data)[1].data)
+
+
+def _costs(what: str, image: Image) -> list[Figure]:
+    progress(f"codec, {what}")
+    chunk, (_, png) = chunk_of(_frame(image)), cv2.imencode(".png", image)
+    into = in_turns(
+        lambda: _cpu_ms(lambda: chunk_of(_frame(image))), lambda: _cpu_ms(lambda: cv2.imencode(".png", image)), ROUNDS
     )
-    decoded = in_turns(
-        lambda: _cpu_ms(lambda: decode_image(PNG, data)),
+    out_of = in_turns(
+        lambda: _cpu_ms(lambda: image_in(chunk)),
         lambda: _cpu_ms(lambda: cv2.imdecode(png, cv2.IMREAD_UNCHANGED)),
         ROUNDS,
     )
-    message = CompressedImage.FromString(data).data
-    room = np.empty_like(image, np.uint8)
-    for_fit = in_turns(
-        lambda: _cpu_ms(lambda: decode_rows(message, room)),
-        lambda: _cpu_ms(lambda: cv2.imdecode(np.frombuffer(message, np.uint8), cv2.IMREAD_UNCHANGED)),
-        ROUNDS,
-    )
-    target = load_target(packaged("targets", "paper-9x6"))
-    rows = rows_to_follow(detect(image, target), target, len(image))
-    in_part = in_turns(
-        lambda: _cpu_ms(lambda: decode_rows(message, room, rows)),
-        lambda: _cpu_ms(lambda: decode_rows(message, room)),
-        ROUNDS,
-    )
-    sizes_MB = [len(data) / 1e6], [len(png) / 1e6]
     return [
-        at_most(25, side_by_side("png, encode 5 MP of 8 bit", "CPU ms", "cv2 default PNG", *encoded)),
-        side_by_side("png, decode it", "CPU ms", "cv2 default PNG", *decoded),
-        side_by_side("png, decode it for the fit", "CPU ms", "cv2, the same PNG", *for_fit),
-        side_by_side("png, decode the rows that a tracker needs", "CPU ms", "all rows", *in_part),
-        side_by_side("png, its size", "MB", "cv2 default PNG", *sizes_MB),
+        side_by_side(f"frame, 5 MP of {what}: into a chunk", "CPU ms", "cv2 default PNG", *into),
+        side_by_side("  out of it, whole", "CPU ms", "cv2 default PNG", *out_of),
+        side_by_side("  its size", "MB", "cv2 default PNG", [len(chunk) / 1e6], [len(png) / 1e6]),
     ]
 
 
 def _of_limit(what: str, image: Image, sigma_DN: float) -> Figure:
-    """How many times smaller the message is than the image, and may be."""
-    ratio = image.nbytes / len(encode_image(_frame(image), "png"))
+    """How many times smaller the chunk is than the image, and may be."""
+    ratio = image.nbytes / len(chunk_of(_frame(image)))
     limit = 8 * image.itemsize / rounded_noise_bit(sigma_DN)
-    figure = side_by_side(f"{what}, noise {sigma_DN:g} DN", ": 1", LIMIT, [ratio], [limit])
-    return ratio_at_least(0.9, figure) if image.itemsize == 1 and sigma_DN == 1.5 else figure
-
-
-def _of_filter(image: Image) -> Figure:
-    """The same beside the entropy of what PNG's average filter leaves, with codes of their own for each 16 rows: no
-    Huffman code is shorter, and of the five filters this one leaves least."""
-    left, above = np.zeros_like(image), np.zeros_like(image)
-    left[:, 1:], above[1:] = image[:, :-1], image[:-1]
-    rest: Any = image - ((left & above) + ((left ^ above) >> 1))
-    bit = [_entropy_bit(rest[row : row + 16]) for row in range(0, len(rest), 16)]
-    ratio = image.nbytes / len(encode_image(_frame(image), "png"))
-    return side_by_side(
-        "png, 8 bit, noise 1.5 DN", ": 1", "entropy behind the filter", [ratio], [8 * len(bit) / sum(bit)]
-    )
-
-
-def _entropy_bit(values: Image) -> float:
-    share = np.bincount(values.ravel()) / values.size
-    share = share[share > 0]
-    return float(-(share * np.log2(share)).sum())
-
-
-def _twelve_bit(clean_DN: Float) -> list[Figure]:
-    progress("codec, 12 bit")
-    images = {sigma_DN: noisy(clean_DN, sigma_DN, np.uint16, 1) for sigma_DN in SIGMAS_12_BIT_DN}
-    image = images[SIGMAS_12_BIT_DN[-1]]
-    own, other = in_turns(
-        lambda: _cpu_ms(lambda: encode_image(_frame(image), "png")),
-        lambda: _cpu_ms(lambda: cv2.imencode(".png", image)),
-        ROUNDS // 2,
-    )
-    return [
-        side_by_side("png, encode 5 MP of 12 bit", "CPU ms", "cv2 default PNG", own, other),
-        *(_of_limit("png, 12 bit in 16", image, sigma_DN) for sigma_DN, image in images.items()),
-    ]
+    return side_by_side(f"frame, {what}, noise {sigma_DN:g} DN", ": 1", LIMIT, [ratio], [limit])
 
 
 def _roi(clean: Float) -> list[Figure]:
     progress("codec, windows around the markers")
     target = load_target(packaged("targets", "paper-9x6"))
     first, image = (noisy(clean, 1.5, np.uint8, seed) for seed in (1, 2))
-    encoder = RoiEncoder(lambda whole: marker_windows(whole, target))
-    whole, frame = encoder(_frame(first)), _frame(image)
-    partial = encoder(frame)
+    keep = MarkerWindows(lambda whole: marker_windows(whole, target))
+    whole, frame = chunk_of(keep(_frame(first))), _frame(image)
+    partial = chunk_of(keep(frame))
     own, other = in_turns(
-        lambda: _cpu_ms(lambda: encoder(frame)), lambda: _cpu_ms(lambda: encode_image(frame, "png")), ROUNDS
+        lambda: _cpu_ms(lambda: chunk_of(keep(frame))), lambda: _cpu_ms(lambda: chunk_of(frame)), ROUNDS
     )
     ratios = [image.nbytes / len(partial)], [image.nbytes / len(whole)]
     search_ms = [_cpu_ms(lambda: marker_windows(image, target)) for _ in range(5)]
-    decode_ms = [_cpu_ms(lambda: decode_image(PNG, partial)) for _ in range(5)]
+    decode_ms = [_cpu_ms(lambda: image_in(partial)) for _ in range(5)]
     return [
-        side_by_side("roi, encode 5 MP, 54 windows", "CPU ms", "whole frame", own, other),
+        side_by_side("roi, 5 MP with 54 windows into a chunk", "CPU ms", "whole frame", own, other),
         side_by_side("roi, ratio, noise 1.5 DN", ": 1", "whole frame", *ratios),
-        absolute("roi, decode it", "CPU ms", decode_ms),
+        absolute("roi, out of it", "CPU ms", decode_ms),
         absolute("roi, search for the windows", "CPU ms", search_ms),
     ]
 

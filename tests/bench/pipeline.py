@@ -13,26 +13,24 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
-import numpy as np
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.writer import CompressionType
 
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, photograph, render
+from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_png
+from thermostand.recording.format.images import ZSTD_LEVEL, ImageArray
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
-from thermostand.recording.format.messages import timestamp
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import telemetry_topics
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.segment import SeriesForm
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 from thermostand.stand.config.stand_config import packaged
@@ -134,48 +132,43 @@ def _peer(session: Path, first: int, end: int) -> int:
     return sum(cv2.findCirclesGrid(opened.frame(number).image, (9, 6))[0] for number in range(first, end))
 
 
-def photographed(index: int) -> bytes:
-    """A PNG of the target, drifted by 0.009 and 0.026 px/K."""
+def photographed(index: int) -> ImageArray:
+    """A photograph of the target, drifted by 0.009 and 0.026 px/K."""
     above_K = SEQUENCE[index][1] - 24
     scene = Scene(tilt_y_deg=3, roll_deg=1, shift_mm=(0.001 * above_K, 0.003 * above_K))
-    return encode_png(photograph(scene, render(scene), index))
+    return photograph(scene, render(scene), index)
 
 
-def write_session(session: Path, photographs: list[bytes], count: int) -> None:
+def write_session(session: Path, photographs: list[ImageArray], count: int) -> None:
     metadata = {"session_id": session.name, "recipe": "pipeline", "camera_serial": "TS-0001", "simulated": "true"}
     attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text(encoding="utf-8")}
     encoder = TelemetryEncoder(DEVICES)
-    image_topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),)
     forms = [
-        (FRAMES, image_topics, CompressionType.NONE, 1_000_000_000),
+        (FRAMES, CAMERA_TOPICS, CompressionType.ZSTD, 1_000_000_000),
         (TELEMETRY, telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000),
     ]
     series: list[Series] = []
     for folder, topics, compression, size in forms:
         (session / folder).mkdir(parents=True)
-        form = SeriesForm(folder, topics, compression, metadata, attachments, size, 600 * NS_PER_S)
+        form = SeriesForm(folder, topics, compression, metadata, attachments, size, 600 * NS_PER_S, level=ZSTD_LEVEL)
         series.append(Series(session / folder, form))
     frames, telemetry = series
     for number in range(count):
         time_ns = START_NS + number * PERIOD_NS
         index = number * len(SEQUENCE) // count
-        message = CompressedImage(
-            timestamp=timestamp(time_ns), frame_id="camera.image", data=photographs[index], format="png"
-        ).SerializeToString()
-        frames.commit([Record(CAMERA_IMAGE, time_ns, message, number)], time_ns)
+        degC = SEQUENCE[index][1] + 20
+        frame = Frame("camera.image", photographs[index], time_ns, 0.1, 0.0, degC, number, time_ns, 0, f"step-{index}")
+        frames.commit(stored(frame), time_ns)
         begins = number == 0 or index != (number - 1) * len(SEQUENCE) // count
-        records = [record for item in _items(number, index, time_ns, begins) for record in encoder.encode(item)]
+        records = [record for item in _items(index, time_ns, begins) for record in encoder.encode(item)]
         telemetry.commit(records, time_ns)
     frames.finish()
     telemetry.finish()
 
 
-def _items(number: int, index: int, time_ns: int, begins: bool) -> Iterator[Item]:
+def _items(index: int, time_ns: int, begins: bool) -> Iterator[Item]:
     role, chamber_degC = SEQUENCE[index]
     if begins:
         parameters: dict[str, object] = {"role": role, "chamber_degC": chamber_degC}
         yield StepMark(time_ns, f"step-{index}", index, "capture", StepState.STARTED, parameters)
     yield Batch("thermometers", time_ns, (Reading("thermometers.air", chamber_degC, "degC", time_ns),))
-    blank = np.zeros((1, 1), np.uint8)
-    frame = Frame("camera.image", blank, time_ns, 0.1, 0.0, chamber_degC + 20, number, time_ns)
-    yield replace(frame, step_id=f"step-{index}")

@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 
 from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
 from tests.recording.recordings import DEVICES
+from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import kinds, messages
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import telemetry_topics
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.segment import SeriesForm, Topic
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 
@@ -77,13 +77,12 @@ def _series(folder: Path, topics: tuple[Topic, ...], compression: CompressionTyp
 
 
 def _write_frames(session: Path) -> None:
-    topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS["raw"]),)
     size = FRAMES_PER_SEGMENT * HEIGHT_px * WIDTH_px
-    series = _series(session / FRAMES, topics, CompressionType.NONE, size)
+    series = _series(session / FRAMES, CAMERA_TOPICS, CompressionType.NONE, size)
     noise = np.random.default_rng(1).integers(0, 256, (HEIGHT_px + 100, WIDTH_px), np.uint8)
     for number in range(SEGMENTS * FRAMES_PER_SEGMENT):
         frame = _frame(number, noise[number % 100 :][:HEIGHT_px])
-        series.commit([Record(CAMERA_IMAGE, frame.time_ns, encode_image(frame, "raw"), number)], frame.time_ns)
+        series.commit(stored(frame), frame.time_ns)
     series.finish()
 
 
@@ -145,6 +144,12 @@ def _frame_figures(small: Path, large: Path) -> list[Figure]:
         ),
         side_by_side("reading, 5 GB open: random 5 MP frame", "ms", "bare pread of the bytes", own_read, bare_read),
         side_by_side("reading, 5 GB: open, random 5 MP frame", "ms", "ours, 1 GB", in_large, in_small),
+        side_by_side(
+            "reading, 1 GB: open, table of 200 frames",
+            "ms",
+            "mcap make_reader, CRCs",
+            *in_turns(_timed(_own_table, small), _timed(_peer_table, small), 5),
+        ),
     ]
 
 
@@ -183,8 +188,21 @@ def _bare_read(session: Path, number: int) -> bytes:
 def _frame_of(readers: list[Any], number: int) -> NDArray[np.uint8]:
     time_ns = START_NS + number * FRAME_PERIOD_NS
     reader = readers[number // FRAMES_PER_SEGMENT % len(readers)]
-    ((_, _, message),) = reader.iter_messages([CAMERA_IMAGE], starting_at=time_ns, ending_before=time_ns + 1)
+    ((_, _, message),) = reader.iter_messages(["/camera/image"], starting_at=time_ns, ending_before=time_ns + 1)
     return np.frombuffer(RawImage.FromString(message.data).data, np.uint8).reshape(HEIGHT_px, WIDTH_px)
+
+
+def _own_table(session: Path) -> object:
+    return Session.open(session).frame_metas()
+
+
+def _peer_table(session: Path) -> object:
+    found: list[Any] = []
+    for path in _frames(session):
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            found += [message.data for _, _, message in reader.iter_messages(["/camera/meta"])]
+    return list(map(messages.decode_frame_meta, found))
 
 
 def _temperature_figures(small: Path, large: Path, night: Path) -> list[Figure]:

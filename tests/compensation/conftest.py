@@ -18,14 +18,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tests.addresses import WORKER
-from thermostand.compensation.finding.png_rows import decode_rows
 from thermostand.compensation.reporting.drawing import figures
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.compile_ahead import compile_ahead
-from thermostand.recording.format.images import encode_png
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 from .rendered import Scene, photograph, render, true_centres_px
@@ -111,10 +109,9 @@ async def record(
 
 
 def compile_fit(lock: Path) -> None:
-    """Decode a frame and find markers, one of them under glare: all that is compiled for it is then kept."""
+    """Find markers, one of them under glare: all that is compiled for it is then kept."""
     with lock.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        decode_rows(encode_png(np.zeros((8, 64), np.uint8)))
         compile_ahead(lambda: None)
 
 

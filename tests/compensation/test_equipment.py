@@ -25,7 +25,7 @@ from thermostand.foundation.items import Event
 def test_a_sensor_stands_with_its_certificate_and_uncertainty(sensor: str, text: str) -> None:
     config = f"thermometers: {{air: {sensor}, laboratory: {{channel: 4}}}}"
     session: Any = SimpleNamespace(
-        frame_metas=[], camera="camera", events=list[Any], attachment={"config.yaml": config}.get
+        frame_metas=list[Any], camera="camera", events=list[Any], attachment={"config.yaml": config}.get
     )
     assert ("Thermometer channels", f"{text}, laboratory") in equipment_of(session)
 
@@ -40,7 +40,7 @@ def test_devices_stand_with_what_they_said_of_themselves_and_other_cameras_do_no
         identity("relays", "Waveshare", "Relay (8)", ""),
         identity("relays", "Waveshare", "Relay (16)", ""),
     ]
-    session: Any = SimpleNamespace(frame_metas=[], camera="camera", events=lambda: events, attachment={}.get)
+    session: Any = SimpleNamespace(frame_metas=list[Any], camera="camera", events=lambda: events, attachment={}.get)
     assert equipment_of(session) == [
         ("Camera", "Basler a2A, serial number 40001, version 1"),
         ("Lens in the stand's file", "25 mm"),

@@ -11,8 +11,7 @@ from thermostand.foundation.readings import Frame
 from thermostand.markers.detection import Flag, detect
 from thermostand.markers.target import load_target
 from thermostand.markers.windows import MARGIN_px, marker_windows
-from thermostand.recording.format.images import decode_image
-from thermostand.recording.format.roi import RoiEncoder
+from thermostand.recording.format.images import MarkerWindows
 
 from .rendered import Scene, photograph, project, render
 
@@ -71,14 +70,14 @@ def test_an_image_too_small_for_any_marker_has_no_windows():
 
 def partial(images):
     """What a recorder keeps of the second image when the first was whole."""
-    encoder = RoiEncoder(lambda image: marker_windows(image, PAPER))
+    keep = MarkerWindows(lambda image: marker_windows(image, PAPER))
     times = (0, 1_000_000_000)
     frames = [Frame("camera.image", image, t, 0.1, 0.0, 40.0, 1, 1) for image, t in zip(images, times, strict=True)]
-    first, second = (decode_image("foxglove.CompressedImage", encoder(frame)) for frame in frames)
+    first, second = map(keep, frames)
     assert first.windows is None
     assert second.windows is not None
-    assert (second.pixels != images[1]).mean() > 0.5, "the test would compare an image with itself"
-    return second.pixels
+    assert (second.image != images[1]).mean() > 0.5, "the test would compare an image with itself"
+    return second.image
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,12 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
+from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
+from thermostand.recording.format.images import frame_topics
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
 from thermostand.recording.writing.segment import Record, SeriesForm, Topic
@@ -27,12 +28,11 @@ ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
 TOPICS = {
     TELEMETRY: (
         Topic(ENCODER.topic, messages.CLASSES[ENCODER.topic], ("thermometers",)),
-        Topic(messages.CAMERA_META, messages.CLASSES[messages.CAMERA_META]),
         Topic(messages.EVENT, messages.CLASSES[messages.EVENT]),
     ),
-    FRAMES: (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),),
+    FRAMES: CAMERA_TOPICS,
 }
-COMPRESSION = {TELEMETRY: CompressionType.ZSTD, FRAMES: CompressionType.NONE}
+COMPRESSION = {TELEMETRY: CompressionType.ZSTD, FRAMES: CompressionType.ZSTD}
 
 
 def form(series, metadata=METADATA, attachments=ATTACHMENTS, topics=None, segment_bytes=1 << 40):
@@ -49,13 +49,12 @@ def telemetry_of(index):
     time_ns = START_NS + index * NS_PER_S
     air = Reading("thermometers.air", 20 + index / 2, "degC", time_ns)
     yield Record(ENCODER.topic, time_ns, ENCODER.encode(Batch("thermometers", time_ns, (air,))))
-    yield Record(messages.CAMERA_META, time_ns, messages.encode_frame_meta(frame(index)), index)
     for event in range(index % 3):  # alike, so that they compress
         yield Record(messages.EVENT, time_ns, messages.encode_event(Event(time_ns, "info", "note", f"{event} " * 40)))
 
 
 def frame_of(index):
-    yield Record(CAMERA_IMAGE, frame(index).time_ns, encode_image(frame(index), "png"), index)
+    yield from stored(frame(index))
 
 
 RECORDS_OF = {TELEMETRY: telemetry_of, FRAMES: frame_of}
@@ -122,10 +121,20 @@ def write_segment(folder, series, indices, finish=False, **changes):
 def read_segment(path):
     """The messages of a finished segment, read strictly."""
     if path.parent.name == FRAMES:
-        read = [read_frame(place) for place in frame_places(path)]
-    else:
-        read = list(telemetry_messages(path, lambda channel: True))
+        return [record for place in frame_places(path) for record in records_at(place)]
+    read = list(telemetry_messages(path, lambda channel: True))
     return [Record(message.topic, message.time_ns, message.data, message.sequence) for message in read]
+
+
+def records_at(place):
+    """The two messages of a recorded frame."""
+    topics, frame, stamps = (
+        frame_topics(place.meta.channel),
+        read_frame(place),
+        (place.sequence, place.meta.published_ns),
+    )
+    yield Record(topics.meta, place.time_ns, frame.meta, *stamps)
+    yield Record(topics.image, place.time_ns, bytes(frame.image), *stamps)
 
 
 def names(directory: Path):

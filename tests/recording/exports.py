@@ -6,7 +6,7 @@ import pyarrow.parquet
 
 from tests.recording.recorded import half_second, record
 from thermostand.recording.exporting.export import export
-from thermostand.recording.format.images import ImageEncoding
+from thermostand.recording.format.images import FrameEncoding
 from thermostand.recording.reading.session import Session
 
 
@@ -24,7 +24,7 @@ def parquet_rows(path):
     return table.select([name for name in table.column_names if name != "time_utc"]).to_pylist()  # datetime has no ns
 
 
-async def exported(tmp_path, *, count=12, items=half_second, encoding: ImageEncoding = "png", **choices):
+async def exported(tmp_path, *, count=12, items=half_second, encoding: FrameEncoding = "zstd", **choices):
     """The recorded session, and the folder it was exported to."""
     await record(tmp_path / "s", count, items, encoding)
     session = Session.open(tmp_path / "s")

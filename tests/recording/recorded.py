@@ -10,8 +10,8 @@ from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
-from thermostand.recording.format.images import ImageEncoding
-from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.images import FrameEncoding
+from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
@@ -60,7 +60,7 @@ async def record(
     directory,
     count=12,
     items=half_second,
-    encoding: ImageEncoding = "png",
+    encoding: FrameEncoding = "zstd",
     segment_s=2.0,
     period_ns=NS_PER_S // 2,
     attachments=ATTACHMENTS,
@@ -92,9 +92,9 @@ def telemetry(session):
 
 
 def images(session):
-    """Every image message as it is in the files, in their order."""
-    paths = (path for path in session.segments if path.parent.name == FRAMES)
-    return [read_frame(place) for path in paths for place in frame_places(path)]
+    """The two messages of every frame as they are in the files, in their order."""
+    places = [place for path in session.frame_segments for place in frame_places(path)]
+    return [(frame.meta, bytes(frame.image)) for frame in map(read_frame, places)]
 
 
 def frame_key(frame):

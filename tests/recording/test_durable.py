@@ -195,7 +195,8 @@ async def test_a_folder_that_was_removed_is_a_loss_at_once_and_none_is_made_agai
     for path in (directory / what[0]).iterdir():
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
-            assert {record.name: record.data.decode() for record in reader.iter_attachments()} == ATTACHMENTS
+            attached = {record.name: record.data for record in reader.iter_attachments() if record.name != "frames"}
+            assert {name: data.decode() for name, data in attached.items()} == ATTACHMENTS
     session = Session.open(directory)
     notes = [event.text for event in session.events() if event.kind == "note"]
     first = 0 if which == "frames" else 5

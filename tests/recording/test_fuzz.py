@@ -15,11 +15,11 @@ import pytest
 from mcap.writer import CompressionType
 
 from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
+from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
 from thermostand.recording.reading.overview import overview
@@ -27,7 +27,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
 from thermostand.recording.repair.verify import verify
 from thermostand.recording.writing.forms import telemetry_topics
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.segment import SeriesForm
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 
@@ -67,13 +67,11 @@ def frame(second):
 
 def write_session(directory, encoding):
     """Four seconds in two chunks of telemetry, and four frames."""
-    topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS[encoding]),)
-    images = [
-        [Record(CAMERA_IMAGE, frame(k).time_ns, encode_image(frame(k), encoding), frame(k).block_id)] for k in range(4)
-    ]
+    compression = CompressionType.NONE if encoding == "raw" else CompressionType.ZSTD
+    images = [stored(frame(k)) for k in range(4)]
     halves = ([item for k in seconds for item in items(k)] for seconds in ((0, 1), (2, 3)))
     telemetry = [[record for item in half for record in ENCODER.encode(item)] for half in halves]
-    write_series(directory / FRAMES, topics, CompressionType.NONE, images)
+    write_series(directory / FRAMES, CAMERA_TOPICS, compression, images)
     write_series(directory / TELEMETRY, telemetry_topics({"camera": "camera"}), CompressionType.ZSTD, telemetry)
 
 
@@ -85,7 +83,7 @@ def write_series(folder, topics, compression, commits):
     series.finish()
 
 
-@pytest.fixture(scope="module", params=["png", "raw"])
+@pytest.fixture(scope="module", params=["zstd", "raw"])
 def sound(request, tmp_path_factory):
     directory = tmp_path_factory.mktemp("sound") / request.param
     write_session(directory, request.param)
@@ -114,7 +112,7 @@ READS = {
     "steps": lambda session: session.steps(),
     "events": lambda session: session.events(),
     "frame times": lambda session: session.frame_times_ns.tolist(),
-    "descriptions": lambda session: session.frame_metas,
+    "descriptions": lambda session: session.frame_metas(),
     "frame": lambda session: [frame_key(session.frame(2))],
     "frames": lambda session: map(frame_key, session.frames()),
     "items": lambda session: map(item_key, session.items()),
@@ -224,7 +222,7 @@ def recorded_messages(directory):
         if path.parent.name == TELEMETRY:
             yield from telemetry_messages(path, lambda channel: True)
         else:
-            yield from map(read_frame, frame_places(path))
+            yield from ((frame.meta, bytes(frame.image)) for frame in map(read_frame, frame_places(path)))
 
 
 @pytest.mark.parametrize(("seed", "part"), PARTS)

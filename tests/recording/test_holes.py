@@ -86,23 +86,23 @@ def test_a_lost_tail_of_both_series_is_incomplete(session):
         "error: telemetry/0004.mcap: is missing, with all that followed: journal.jsonl says that the run ended at "
         "2026-01-01 18:00:20 UTC, the telemetry stops at 2026-01-01 18:00:14 UTC; "
         "12 of the 20 frames of the plan are there",
-        "error: 3 frames are missing, though described in the telemetry: blocks 12 to 14, "
-        "2026-01-01 18:00:12 to 2026-01-01 18:00:14 UTC",
+        "error: 3 frames of capture-12 to capture-14, 2026-01-01 18:00:12 to 2026-01-01 18:00:14 UTC: "
+        "missing, though their steps are done",
     ]
     assert refused(session) == (
         f"{session}: is incomplete; missing: telemetry/0004.mcap and what follows it (from 2026-01-01 18:00:14 UTC); "
-        "frames/0003.mcap and what follows it (from 2026-01-01 18:00:11 UTC, 3 frames that are described); "
+        "frames/0003.mcap and what follows it (from 2026-01-01 18:00:11 UTC, 3 frames of steps that are done); "
         "12 of the 20 frames of the plan are there"
     )
 
 
-def test_frames_deleted_from_the_end_alone_are_missed_by_their_descriptions(session):
+def test_frames_deleted_from_the_end_alone_are_missed_by_their_steps(session):
     remove(session, FRAMES, *last_numbers(session, FRAMES, 1))
     assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
     assert "missing: frames/0004.mcap and what follows it (from 2026-01-01 18:00:15 UTC, 4 frames" in refused(session)
     shutil.rmtree(session / FRAMES)
     assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
-    assert "missing: frames/0000.mcap and what follows it (20 frames that are described)" in refused(session)
+    assert "missing: frames/0000.mcap and what follows it (20 frames of steps that are done)" in refused(session)
 
 
 def test_without_its_journal_a_lost_tail_leaves_no_end_and_is_incomplete(session):
@@ -171,7 +171,7 @@ def test_a_gap_is_reported_with_its_times_and_its_frames(session):
     assert verify(session).files is glance(session).state is Files.INCOMPLETE
     assert refused(session) == (
         f"{session}: is incomplete; missing: telemetry/0001.mcap to 0002.mcap (from 2026-01-01 18:00:02 to "
-        "2026-01-01 18:00:11 UTC, 4 frames without their descriptions); "
+        "2026-01-01 18:00:11 UTC); "
         "frames/0001.mcap (from 2026-01-01 18:00:03 to 2026-01-01 18:00:08 UTC); "
         "16 of the 20 frames of the plan are there"
     )
@@ -274,11 +274,10 @@ async def test_what_a_kill_cost_is_no_hole_and_its_copies_are_sound(tmp_path):
     salvage_session(directory)
     write_journal(directory, *entries(16, ""))
     assert words(directory) == (Run.INTERRUPTED, Files.SOUND)
-    holes = open_whole(directory).holes
-    assert [(hole.series, hole.first, hole.excused) for hole in holes] == [(TELEMETRY, None, True)]
+    assert open_whole(directory).holes == ()
     copy = await replay_and_record(Session.open(directory), tmp_path / "copy", None)
     assert words(copy) == (Run.INTERRUPTED, Files.SOUND)
-    assert telemetry(Session.open(copy)) == telemetry(Session.open(directory))  # no description is invented
+    assert telemetry(Session.open(copy)) == telemetry(Session.open(directory))
     part = trim(Session.open(directory), tmp_path / "part", START_NS, START_NS + 100 * NS_PER_S)
     assert words(part) == (Run.INTERRUPTED, Files.SOUND)
 
@@ -289,22 +288,13 @@ async def test_frames_the_recorder_said_it_lost_are_no_hole(tmp_path):
     assert open_whole(directory).holes == ()
 
 
-async def test_a_replay_hands_on_frames_without_their_descriptions_and_no_descriptions_without_their_frames(session):
-    original = missing_middle(session)
-    frames = [item for item in original.items() if hasattr(item, "image")]
-    assert len(frames) == original.frame_count
-    assert len(list(original.items_and_descriptions())) == len(list(original.items())) + sum(
-        hole.frames for hole in original.holes if hole.series == FRAMES
-    )
-
-
 def test_a_session_of_a_later_format_is_refused_with_a_sentence(tmp_path):
-    write_segment(tmp_path / TELEMETRY, TELEMETRY, range(2), finish=True, metadata={**METADATA, "format": "3"})
-    with pytest.raises(SessionError, match="is of format '3'; this version of thermostand reads up to 2"):
+    write_segment(tmp_path / TELEMETRY, TELEMETRY, range(2), finish=True, metadata={**METADATA, "format": "4"})
+    with pytest.raises(SessionError, match="is of format '4'; this version of thermostand reads up to 3"):
         Session.open(tmp_path)
 
 
-@pytest.mark.parametrize("format_text", ["", "1"])
+@pytest.mark.parametrize("format_text", ["", "1", "2"])
 def test_a_session_of_an_earlier_format_is_refused_with_a_sentence(session, format_text):
     everywhere(session, format=format_text)
     with pytest.raises(SessionError, match="was recorded by an earlier, unreleased version of thermostand"):
@@ -313,11 +303,11 @@ def test_a_session_of_an_earlier_format_is_refused_with_a_sentence(session, form
 
 
 def test_of_a_later_format_it_is_unknown_whether_everything_is_there(session):
-    everywhere(session, format="3")
+    everywhere(session, format="4")
     found, seen = verify(session), glance(session)
     assert found.files is seen.state is Files.UNKNOWN
     assert not found.is_sound
-    assert "is of format '3'; this version of thermostand reads up to 2" in seen.state_text
+    assert "is of format '4'; this version of thermostand reads up to 3" in seen.state_text
     assert "what that format adds was not checked" in str(found.findings[0])
 
 

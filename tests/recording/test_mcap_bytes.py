@@ -5,12 +5,12 @@ import zlib
 
 import pytest
 import zstandard
+from mcap.reader import SeekingReader
 
 from tests.recording.damage import write_segment
-from tests.recording.fuzzed import Record, put_together, take_apart
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.layout import TELEMETRY
-from thermostand.recording.format.mcap_bytes import INFLATED_LIMIT_BYTES, Source, chunk_content, records
+from thermostand.recording.format.mcap_bytes import Source, chunk_content, records
 from thermostand.recording.format.records import telemetry_messages
 from thermostand.recording.reading.walk import stored_messages, survey
 from thermostand.recording.repair.salvage import salvage_session
@@ -44,7 +44,7 @@ def test_a_sound_chunk_gives_its_head_and_its_records(name):
         (chunk() + b"more", "size is wrong"),
         (chunk(name=b"lz4"), "compressed with b'lz4'"),
         (chunk(size=1 << 40), "claims 1099511627776 bytes"),
-        (chunk(size=INFLATED_LIMIT_BYTES + 1, name=b"zstd"), "claims 16777217 bytes"),
+        (chunk(size=1 << 40, name=b"zstd"), "claims 1099511627776 bytes"),
     ],
 )
 def test_a_damaged_chunk_is_refused(damaged, text):
@@ -55,10 +55,11 @@ def test_a_damaged_chunk_is_refused(damaged, text):
 def test_what_the_reader_refuses_neither_salvage_nor_verification_accepts(tmp_path):
     path = tmp_path / TELEMETRY / "0000.mcap"
     whole = write_segment(path.parent, TELEMETRY, range(3), finish=True)
-    large = take_apart(whole.data)
-    (first, *_) = (record for record in large if record.inner)
-    first.inner.append(Record(5, struct.pack("<HIQQ", 1, 0, 0, 0) + bytes(INFLATED_LIMIT_BYTES)))
-    path.write_bytes(put_together(large))
+    large = bytearray(whole.data)
+    with path.open("rb") as file:
+        place = SeekingReader(file).get_summary().chunk_indexes[0].chunk_start_offset
+    large[place + 25 : place + 33] = struct.pack("<Q", 1 << 40)  # its size, uncompressed
+    path.write_bytes(large)
     with pytest.raises(SessionError, match="a chunk"):
         list(telemetry_messages(path, lambda channel: True))
     assert any("a chunk claims" in finding.text for finding in verify(tmp_path).findings)

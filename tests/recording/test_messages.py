@@ -147,13 +147,6 @@ def test_the_table_pose_is_metres_and_a_turn_about_z():
     assert (pose.orientation.z, pose.orientation.w) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
 
 
-def test_a_frame_description_survives_the_round_trip():
-    original = frame(np.zeros((2, 2), np.uint8))
-    meta = messages.decode_frame_meta(messages.encode_frame_meta(original))
-    for name in ("channel", "step_id", "block_id", "camera_ticks", "exposure_s", "gain_dB", "camera_degC", "dropped"):
-        assert getattr(meta, name) == getattr(original, name)
-
-
 @given(st.binary(max_size=60))
 def test_random_bytes_are_a_message_or_a_session_error(data):
     decoders = [

@@ -12,19 +12,19 @@ from mcap.writer import CompressionType
 
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
+from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.items import Batch
+from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
-from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.format.records import frame_places, telemetry_messages
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import telemetry_topics
+from thermostand.recording.writing.forms import frames_topics, telemetry_topics
 from thermostand.recording.writing.recorder import Recorder
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.segment import Record, SeriesForm
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import BatchEncoder, TelemetryEncoder
 
@@ -57,8 +57,7 @@ def write_items(directory, items, devices=DEVICES, **options):
 
 
 def write_images(directory, frames):
-    commits = [[Record(CAMERA_IMAGE, f.time_ns, encode_image(f, "png"), f.block_id & 0xFFFF_FFFF)] for f in frames]
-    write(directory / FRAMES, (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),), commits)
+    write(directory / FRAMES, CAMERA_TOPICS, list(map(stored, frames)), CompressionType.ZSTD)
 
 
 def air(value, second, **changes):
@@ -134,28 +133,28 @@ def test_an_empty_batch_is_an_item_too(tmp_path):
     assert list(Session.open(tmp_path).items()) == items
 
 
-def test_a_frame_without_description_comes_in_order_of_time_and_a_description_without_frame_gives_none(tmp_path):
-    write_items(tmp_path, [batch(0), small_frame(1), batch(2), small_frame(3), batch(4)])
-    write_images(tmp_path, [small_frame(second) for second in (1, 1.5, 5)])
+def test_a_frame_comes_behind_what_was_published_at_its_instant_and_before_the_end_of_its_step(tmp_path):
+    ended = StepMark(at(2), "capture", 0, "capture", StepState.DONE)
+    write_items(tmp_path, [batch(0), batch(2), ended, batch(3)])
+    frames = [replace(small_frame(second), step_id=step_id) for second, step_id in ((1, ""), (2, "capture"), (4, ""))]
+    write_images(tmp_path, frames)
+    items = [(type(item).__name__, (item.time_ns - START_NS) / NS_PER_S) for item in Session.open(tmp_path).items()]
+    order = [("Batch", 0), ("Frame", 1), ("Batch", 2), ("Frame", 2), ("StepMark", 2), ("Batch", 3), ("Frame", 4)]
+    assert items == order
+
+
+def test_frames_of_one_instant_are_distinguished_by_their_camera_and_number(tmp_path):
+    write_items(tmp_path, [batch(1)])
+    frames = [small_frame(1, 7), replace(small_frame(1, 7), channel="side.image"), small_frame(1, 8)]
+    topics = frames_topics({"camera": "camera", "side": "camera"})
+    write(tmp_path / FRAMES, topics, list(map(stored, frames)), CompressionType.ZSTD)
     session = Session.open(tmp_path)
-    reported = [(type(item).__name__, (item.time_ns - START_NS) / NS_PER_S) for item in session.items()]
-    assert reported == [
-        ("Batch", 0),
-        ("Frame", 1),
-        ("UndescribedFrame", 1.5),
-        ("Batch", 2),
-        ("Batch", 4),
-        ("UndescribedFrame", 5),
+    assert [(frame.channel, frame.block_id) for frame in session.frames()] == [
+        ("camera.image", 7),
+        ("side.image", 7),
+        ("camera.image", 8),
     ]
-    assert [time_ns for time_ns, _ in session.frame_metas] == [at(1), at(3)]
-    assert [meta.block_id for _, meta in session.frame_metas] == [1, 3]
-
-
-def test_frames_of_one_instant_are_distinguished_by_their_number(tmp_path):
-    write_items(tmp_path, [small_frame(1, 8), batch(1), small_frame(1, 7), batch(2)])
-    write_images(tmp_path, [small_frame(1, number) for number in (7, 8, 9)])
-    items = list(Session.open(tmp_path).items())
-    assert [item.block_id if isinstance(item, Frame) else "batch" for item in items] == [8, "batch", 7, 9, "batch"]
+    assert [session.frame(index).channel for index in range(3)] == ["camera.image", "side.image", "camera.image"]
 
 
 def test_items_hold_one_image_at_a_time(tmp_path):
@@ -186,19 +185,45 @@ def test_segments_that_overlap_in_time_are_one_order(tmp_path):
         write_images(tmp_path, [small_frame(second) for second in seconds])
     session = Session.open(tmp_path)
     assert [session.frame(index).block_id for index in range(5)] == [0, 1, 2, 3, 4]
-    assert [image.sequence for image in session.images()] == [0, 1, 2, 3, 4]
+    assert [image.meta.block_id for image in session.images()] == [0, 1, 2, 3, 4]
     assert session.frame_times_ns.tolist() == [at(second) for second in range(5)]
 
 
 def test_images_come_as_they_were_recorded(tmp_path):
-    write_items(tmp_path, [small_frame(0)])
-    write_images(tmp_path, [small_frame(0), small_frame(1)])
-    described, bare = Session.open(tmp_path).images()
-    assert described.schema == "foxglove.CompressedImage"
-    assert described.data == encode_image(small_frame(0), "png")
-    assert (described.sequence, described.time_ns, described.meta.block_id) == (0, at(0), 0)
-    assert described.path == tmp_path / FRAMES / "0000.mcap"
-    assert bare.meta is None
+    write_items(tmp_path, [batch(0)])
+    write_images(tmp_path, [small_frame(0)])
+    (image,) = Session.open(tmp_path).images()
+    assert (image.description, bytes(image.data)) == tuple(record.data for record in stored(small_frame(0)))
+    assert (image.time_ns, image.meta.block_id, image.path) == (at(0), 0, tmp_path / FRAMES / "0000.mcap")
+
+
+def test_the_table_of_frames_is_read_without_an_image(tmp_path):
+    write_items(tmp_path, [batch(0)])
+    write_images(tmp_path, [small_frame(second) for second in range(3)])
+    path = tmp_path / FRAMES / "0000.mcap"
+    (places, data) = frame_places(path), bytearray(path.read_bytes())
+    for place in places:
+        data[place.chunk.offset + place.chunk.length - 4] ^= 0xFF  # within the compressed image
+    path.write_bytes(data)
+    session = Session.open(tmp_path)
+    assert [meta.block_id for meta in session.frame_metas()] == [0, 1, 2]
+    with pytest.raises(SessionError, match="damaged"):
+        session.frame(1)
+
+
+def test_frames_that_another_writer_wrote_without_a_table_are_read(tmp_path):
+    write_items(tmp_path, [batch(0)])
+    write_images(tmp_path, [small_frame(second) for second in range(3)])
+
+    def without_table(records):
+        records[:] = [r for r in records if not (r.opcode == Opcode.ATTACHMENT and b"\x06\0\0\0frames" in r.content)]
+        records[:] = [r for r in records if not (r.opcode == Opcode.ATTACHMENT_INDEX and b"frames" in r.content)]
+        (statistics,) = (r for r in records if r.opcode == Opcode.STATISTICS)
+        count = int.from_bytes(statistics.content[14:18], "little") - 1
+        statistics.content = statistics.content[:14] + count.to_bytes(4, "little") + statistics.content[18:]
+
+    rewrite(tmp_path / FRAMES / "0000.mcap", without_table)
+    assert [frame.block_id for frame in Session.open(tmp_path).frames()] == [0, 1, 2]
 
 
 def test_only_the_segments_that_are_needed_are_read(tmp_path):

@@ -78,7 +78,7 @@ async def test_a_reader_no_one_here_wrote_decodes_every_message(tmp_path):
             for schema, channel, message, _ in reader.iter_decoded_messages():
                 seen.setdefault((channel.topic, schema.name), []).append(message.log_time)
     assert {name: len(times) for name, times in seen.items()} == {
-        ("/camera/image", "foxglove.CompressedImage"): 5,
+        ("/camera/image", "foxglove.RawImage"): 5,
         ("/camera/meta", "thermostand.FrameMeta"): 5,
         ("/sensors/temperature", "thermostand.Temperatures"): 5,
         ("/chamber/state", "thermostand.ChamberState"): 5,
@@ -146,7 +146,7 @@ async def test_flushed_returns_when_all_before_it_is_on_the_disk_without_a_wait_
         hub.publish(Event(START_NS + index, "info", "note", f"second {index}"))
     assert recorder.saved == Saved(0, 0, 0)
     await recorder.flushed()
-    assert recorder.saved == Saved(12, 36, 0)  # a description for each frame; two messages for each event
+    assert recorder.saved == Saved(12, 24, 0)  # two messages for each event
     assert clock.now_ns() == START_NS
     assert len(list(committed_event_texts(tmp_path / "s"))) == 12
     await recorder.flushed()

@@ -19,7 +19,6 @@ from tests.recording.recordings import (
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event
-from thermostand.recording.format.images import encode_image
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.notices import Losses, ranges
 from thermostand.recording.writing.recorder import Saved
@@ -106,27 +105,27 @@ async def test_flushed_waits_for_telemetry_the_disk_refuses(tmp_path, files_limi
     await recorder.finish()
 
 
-async def test_frames_that_did_not_fit_the_queue_are_described_all_the_same(tmp_path):
+async def test_frames_that_did_not_fit_the_queue_are_lost(tmp_path):
     recorder, _, hub, tasks = await start(tmp_path / "s", replace(SETTINGS, queue_frames=3))
     for index in range(10):
         hub.publish(frame(START_NS + index, index))
     await recorder.flushed()
-    assert recorder.saved == Saved(3, 10, 7)
+    assert recorder.saved == Saved(3, 0, 7)
     await stop(tasks)
     await recorder.finish()
 
 
 async def test_a_frame_that_cannot_be_encoded_is_lost_and_the_next_one_is_not(tmp_path):
-    def encode(got):
+    def prepare(got):
         if got.block_id == 1:
             raise ValueError("no marker in sight")
-        return encode_image(got, "png")
+        return got
 
-    recorder, _, hub, tasks = await start(tmp_path / "s", SETTINGS, encode)
+    recorder, _, hub, tasks = await start(tmp_path / "s", SETTINGS, prepare)
     for index in range(3):
         hub.publish(frame(START_NS + index, index))
     await recorder.flushed()
-    assert recorder.saved == Saved(2, 3, 1)
+    assert recorder.saved == Saved(2, 0, 1)
     await stop(tasks)
     await recorder.finish()
     session = Session.open(tmp_path / "s")

@@ -52,7 +52,7 @@ def deep(time_ns, index):
     yield from half_second(time_ns, index, np.uint16)
 
 
-@pytest.mark.parametrize(("items", "encoding"), [(half_second, "png"), (half_second, "raw"), (deep, "png")])
+@pytest.mark.parametrize(("items", "encoding"), [(half_second, "zstd"), (half_second, "raw"), (deep, "zstd")])
 async def test_a_recorded_replay_is_the_same_session(tmp_path, items, encoding):
     await record(tmp_path / "s", items=items, encoding=encoding)
     original = Session.open(tmp_path / "s")
@@ -150,7 +150,7 @@ async def test_a_session_that_breaks_off_leaves_no_copy(tmp_path):
     session = Session.open(tmp_path / "s")
     damaged = session.segments[-1]
     content = bytearray(damaged.read_bytes())
-    content[content.index(b"IDAT") + 20] ^= 1
+    content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
     with pytest.raises(SessionError, match="damaged"):
         await replay_and_record(session, tmp_path / "r", None)
@@ -190,7 +190,8 @@ async def test_a_copy_on_a_disk_that_is_nearly_full_is_the_same_session(tmp_path
 async def test_a_copy_that_would_lack_frames_does_not_appear(tmp_path):
     def items(time_ns, index):
         for item in half_second(time_ns, index):
-            yield replace(item, image=np.zeros((400, 500), np.uint8)) if isinstance(item, Frame) else item
+            noise = np.random.default_rng(index).integers(0, 255, (400, 500), np.uint8)
+            yield replace(item, image=noise) if isinstance(item, Frame) else item
 
     await record(tmp_path / "s", items=items, encoding="raw")
     with tmpfs(tmp_path / "disk", "24m") as disk:

@@ -96,12 +96,12 @@ def test_every_stretch_between_several_holes_is_delivered(damaged, series):
 
 
 def test_a_copy_says_from_what_it_was_made_and_reads_like_a_recording(damaged):
-    folder, _, _ = damaged(FRAMES, lambda data: data[:-60])
+    folder, _, _ = damaged(FRAMES, lambda data: data[:-160])
     (done,) = salvage_session(folder.parent)
     assert metadata_of(done.path, "salvage") == {
         "source": "0001.mcap.part",
         "reason": done.reason,
-        "messages": "23",
+        "messages": "46",
         "lost_bytes": "0",
         "damaged_places": "0",
     }
@@ -130,10 +130,10 @@ def test_what_was_wrong_and_what_became_of_it_is_said(damaged):
     folder, _, _ = damaged(FRAMES, lambda data: hole(9000, 9100)(hole(30_000, 30_100)(data)))
     (done,) = salvage_session(folder.parent)
     assert done.reason.startswith(f"2 damaged places of {done.lost_bytes} bytes")
-    folder, _, _ = damaged(FRAMES, lambda data: data[:-60])
+    folder, _, _ = damaged(FRAMES, lambda data: data[:-160])
     (done,) = salvage_session(folder.parent)
     assert re.match(r"a block of \d+ bytes was being written at its end$", done.reason)
-    assert salvage_line(done).endswith(f"0001.mcap.part: 23 messages in 0001.mcap ({done.reason})")
+    assert salvage_line(done).endswith(f"0001.mcap.part: 46 messages in 0001.mcap ({done.reason})")
 
 
 def test_a_second_damaged_original_of_a_number_gets_a_name_of_its_own(damaged):

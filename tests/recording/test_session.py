@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
+from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import CAMERA_IMAGE, IMAGE_CLASS, encode_image
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.segment import Record, SeriesForm, Topic
@@ -23,7 +23,7 @@ ATTACHMENTS = {"config.yaml": "a: 1\n", "target.yaml": "rows: 6\n"}
 ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
 TELEMETRY_TOPICS = (
     Topic(ENCODER.topic, messages.CLASSES[ENCODER.topic], ("thermometers",)),
-    *(Topic(name, messages.CLASSES[name]) for name in (messages.CAMERA_META, messages.STEP, messages.EVENT)),
+    *(Topic(name, messages.CLASSES[name]) for name in (messages.STEP, messages.EVENT)),
 )
 
 
@@ -36,7 +36,6 @@ def telemetry_of(second):
     time_ns = START_NS + second * NS_PER_S
     air = Reading("thermometers.air", 20 + second / 2, "degC", time_ns)
     yield Record(ENCODER.topic, time_ns, ENCODER.encode(Batch("thermometers", time_ns, (air,))))
-    yield Record(messages.CAMERA_META, time_ns, messages.encode_frame_meta(frame(second)), second)
     yield Record(messages.STEP, time_ns, messages.encode_step(mark(second)))
     yield Record(messages.EVENT, time_ns, messages.encode_event(event(second)))
 
@@ -63,13 +62,8 @@ def write_series(folder, seconds, series_form, records_of):
 
 
 def write_frames(directory, seconds, metadata=METADATA):
-    topics = (Topic(CAMERA_IMAGE, IMAGE_CLASS["png"]),)
-    write_series(
-        directory / FRAMES,
-        seconds,
-        form(FRAMES, topics, CompressionType.NONE, metadata),
-        lambda k: [Record(CAMERA_IMAGE, frame(k).time_ns, encode_image(frame(k), "png"), k)],
-    )
+    series_form = form(FRAMES, CAMERA_TOPICS, CompressionType.ZSTD, metadata)
+    write_series(directory / FRAMES, seconds, series_form, lambda k: stored(frame(k)))
 
 
 def write_telemetry(directory, seconds, metadata=METADATA):
@@ -144,15 +138,6 @@ def test_messages_written_late_are_read_in_order_of_time(tmp_path):
     session = Session.open(tmp_path)
     assert session.readings("thermometers.air")[1].tolist() == [20.0, 20.5, 21.0]
     assert session.steps() == [mark(0), mark(1), mark(2)]
-
-
-def test_a_frame_without_its_description_is_still_a_frame(tmp_path):
-    write_telemetry(tmp_path, [0])
-    write_frames(tmp_path, [0, 1])
-    described, bare = Session.open(tmp_path).frames()
-    assert described.camera_degC == 41.0
-    assert (bare.channel, bare.time_ns, bare.block_id) == ("camera.image", frame(1).time_ns, 1)
-    assert np.isnan([bare.exposure_s, bare.gain_dB, bare.camera_degC]).all()
 
 
 def test_a_session_without_frames_has_none(tmp_path):

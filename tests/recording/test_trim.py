@@ -34,7 +34,7 @@ async def test_a_part_is_a_session_with_every_message_of_its_range(tmp_path):
     begin_ns, end_ns = START_NS + 3 * HALF_NS, START_NS + 9 * HALF_NS
     part, rest, event = trimmed(session, tmp_path / "part", begin_ns, end_ns)
     assert rest == within(telemetry(session), begin_ns, end_ns)
-    assert images(part) == within(images(session), begin_ns, end_ns)
+    assert images(part) == images(session)[4:10]
     assert part.frame_times_ns.tolist() == [START_NS + k * HALF_NS - 50 * MS for k in range(4, 10)]
     assert session.metadata == INFO.metadata()
     assert {name: text for name, text in part.metadata.items() if name != "extent"} == session.metadata
@@ -91,7 +91,7 @@ async def test_the_step_under_way_is_shown_again_at_the_start(tmp_path):
 async def test_a_part_of_a_part_and_its_replay_keep_the_origin(tmp_path):
     await record(tmp_path / "s", 8)
     once = Session.open(trim(Session.open(tmp_path / "s"), tmp_path / "once", 0, START_NS + 2 * NS_PER_S))
-    assert min(message.time_ns for message in telemetry(once)) == START_NS - 50 * MS
+    assert min(message.time_ns for message in telemetry(once)) == START_NS
     twice = Session.open(trim(once, tmp_path / "twice", START_NS, START_NS + NS_PER_S))
     assert [event.kind for event in twice.events()] == [TRIMMED, TRIMMED, "note", "note"]
     copy = Session.open(await replay_and_record(twice, tmp_path / "copy", None))
@@ -109,10 +109,10 @@ async def test_a_long_part_is_cut_into_segments_as_a_recording_is(tmp_path):
 
 async def test_images_of_several_kinds_keep_theirs(tmp_path):
     await record(tmp_path / "s", 3, encoding="raw")
-    await record(tmp_path / "s", 3, encoding="png")  # a second run continues the folder, at the same instants
+    await record(tmp_path / "s", 3, encoding="zstd")  # a second run continues the folder, at the same instants
     session = Session.open(tmp_path / "s")
     part, _, _ = trimmed(session, tmp_path / "part", 0, START_NS + NS_PER_S)
-    assert images(part) == within(images(session), 0, START_NS + NS_PER_S)
+    assert sorted(images(part)) == sorted([*images(session)[:3], *images(session)[3:]])
     for index, got in enumerate(sorted(part.frames(), key=lambda got: got.block_id)):
         np.testing.assert_array_equal(got.image, frame(0, index // 2).image)
 
@@ -131,7 +131,7 @@ async def test_a_part_that_cannot_be_read_whole_leaves_nothing(tmp_path):
     session = Session.open(tmp_path / "s")
     damaged = sorted((tmp_path / "s" / FRAMES).iterdir())[1]
     content = bytearray(damaged.read_bytes())
-    content[content.index(b"IDAT") + 20] ^= 1
+    content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
     with pytest.raises(SessionError, match="damaged"):
         trim(session, tmp_path / "part", 0, START_NS + 60 * NS_PER_S)

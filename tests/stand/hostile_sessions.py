@@ -15,13 +15,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import CAMERA_IMAGE
-from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.layout import FRAME_TABLE, FRAMES, TELEMETRY
 from thermostand.recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
 from thermostand.recording.reading.journal_lines import journal_lines, lines_of
 
@@ -137,10 +136,12 @@ def rewritten(path: Path, attachments: dict[str, bytes] | None = None, behind=()
         known = list(reader.iter_attachments())
         metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
         found = [(channel.topic, message) for _, channel, message in reader.iter_messages(log_time_order=False)]
+    table = [one.data for one in known if one.name == FRAME_TABLE]
+    known = [one for one in known if one.name != FRAME_TABLE]
     is_frames = path.parent.name == FRAMES
     new = path.with_suffix(".new")
     with new.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE if is_frames else CompressionType.ZSTD)
+        writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start()
         for one in known:
             data = one.data if attachments is None else attachments.get(one.name, one.data)
@@ -156,13 +157,15 @@ def rewritten(path: Path, attachments: dict[str, bytes] | None = None, behind=()
             for _, c in sorted(summary.channels.items())
         }
         for topic, message in found:
-            data = instead(message.data) if instead and topic == CAMERA_IMAGE else message.data
+            data = instead(message.data) if instead and topic.endswith("/image") else message.data
             writer.add_message(channels[topic], message.log_time, data, message.publish_time, message.sequence)
-            if is_frames:
+            if is_frames and topic.endswith("/image"):
                 writer.flush()
         last = found[-1][1].log_time
         for topic, data in behind:
             writer.add_message(channels[topic], last, data, last, 0)
+        for data in table:
+            writer.add_attachment(0, 0, FRAME_TABLE, "application/x-protobuf", data)
         writer.finish()
     new.replace(path)
 
@@ -210,21 +213,22 @@ def black(width: int, height: int) -> bytes:
     return png(width, height, b"".join(packer.compress(row) for _ in range(height)) + packer.flush())
 
 
-def imaged(data: Callable[[], bytes]) -> Callable[[Path], None]:
-    """A session whose first frames are that file."""
+def imaged(change: Callable[[RawImage], object]) -> Callable[[Path], None]:
+    """A session whose first images are changed so."""
 
     def make(session: Path) -> None:
-        made = data()
-
         def image(message: bytes) -> bytes:
-            read = CompressedImage.FromString(message)
-            return CompressedImage(
-                frame_id=read.frame_id, timestamp=read.timestamp, format="png", data=made
-            ).SerializeToString()
+            read = RawImage.FromString(message)
+            change(read)
+            return read.SerializeToString()
 
         rewritten(frames(session, 0), instead=image)
 
     return make
+
+
+def sized(image: RawImage, width: int, height: int, data: bytes) -> None:
+    image.width, image.height, image.step, image.data = width, height, width, data
 
 
 def merges(depth: int) -> bytes:
@@ -353,10 +357,12 @@ ROWS: dict[str, Row] = {
     "a step of wrong types": Row(reported(step('{"duration_s": "x", "frames": -1}', index=2_000_000_000)), SOUND),
     "a step that is no JSON": Row(reported(step("{")), DAMAGED),
     # images
-    "a picture of 256 megapixels": Row(imaged(lambda: black(16_000, 16_000)), SOUND),
-    "a picture of 4 million megapixels": Row(imaged(lambda: png(2_000_000, 2_000_000, b"x")), SOUND),
-    "a picture in colour": Row(imaged(lambda: png(4, 3, zlib.compress(bytes(39)), colour=2)), SOUND),
-    "a picture of another format": Row(imaged(lambda: b"GIF89a" + bytes(100)), SOUND),
-    "a picture cut off": Row(imaged(lambda: black(40, 30)[:-20]), SOUND),
-    "a picture of 60 megapixels": Row(imaged(lambda: black(10_000, 6_000)), SOUND, nightly=True),
+    "a picture of 256 megapixels": Row(imaged(lambda read: sized(read, 16_000, 16_000, b"x")), SOUND),
+    "a picture of 4 million megapixels": Row(imaged(lambda read: sized(read, 2_000_000, 2_000_000, b"x")), SOUND),
+    "a picture in colour": Row(imaged(lambda read: setattr(read, "encoding", "rgb8")), SOUND),
+    "a picture of another format": Row(imaged(lambda read: setattr(read, "encoding", "GIF89a\x1b[2J")), SOUND),
+    "a picture cut off": Row(imaged(lambda read: setattr(read, "data", read.data[:-20])), SOUND),
+    "a picture of 60 megapixels": Row(
+        imaged(lambda read: sized(read, 10_000, 6_000, bytes(60_000_000))), SOUND, nightly=True
+    ),
 }

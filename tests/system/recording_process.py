@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.recording.stored import stored
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import CAMERA_IMAGE, encode_image
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.segment import Record
 from thermostand.recording.writing.telemetry import BatchEncoder
@@ -39,7 +39,7 @@ SETTINGS = RecordingSettings(
     alert_below_fraction=0.0,
 )
 BATCHES = 2
-MESSAGES_PER_ROUND = 1 + BATCHES  # a frame's description is telemetry, too
+MESSAGES_PER_ROUND = BATCHES
 ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
 PROGRESS = struct.Struct("<QQQQ")  # process (0: it has ended), rounds published, frames and messages saved
 
@@ -56,16 +56,19 @@ def batches_of(index):
 
 
 def frame_records(count):
-    """What the frames of the first rounds are on the disk."""
-    return [Record(CAMERA_IMAGE, f.time_ns, encode_image(f, "png"), f.block_id) for f in map(frame_of, range(count))]
+    """What the images of the first rounds are on the disk."""
+    return images_in(record for index in range(count) for record in stored(frame_of(index)))
+
+
+def images_in(records):
+    """Of the records of frames the images, which are the same in each recording."""
+    return [record._replace(published_ns=0) for record in records if record.topic.endswith("/image")]
 
 
 def telemetry_records(rounds):
     """The same for the telemetry."""
     records = []
     for index in range(rounds):
-        frame = frame_of(index)
-        records.append(Record(messages.CAMERA_META, frame.time_ns, messages.encode_frame_meta(frame), index))
         records += [Record(ENCODER.topic, batch.time_ns, ENCODER.encode(batch)) for batch in batches_of(index)]
     return records
 

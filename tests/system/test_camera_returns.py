@@ -44,7 +44,7 @@ async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_
     assert session.events()[-1].text == "complete"
     begins_ns = begins_of(session.events())
     assert (
-        len([meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]) == 3
+        len([meta for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)]) == 3
     )
     kinds = [event.kind for event in session.events()]
     assert "camera_equilibrium_lost" in kinds  # it has restarted: the frame before is taken again when it has soaked

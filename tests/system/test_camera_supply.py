@@ -50,7 +50,7 @@ def check_soaked(session: Session, since_ns: int) -> None:
     assert isinstance(soaked_s, float)
     assert rate < 0.2
     assert soaked_s >= 600.0
-    later_ns = [time_ns for time_ns, _ in session.frame_metas if time_ns > since_ns]
+    later_ns = [meta.time_ns for meta in session.frame_metas() if meta.time_ns > since_ns]
     assert later_ns
     assert min(later_ns) > reached[0].time_ns
     times_ns, camera_degC = session.readings("camera.temperature")

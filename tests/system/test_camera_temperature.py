@@ -99,7 +99,7 @@ async def test_a_temperature_that_goes_holds_the_run_until_it_is_back(tmp_path: 
     times_ns, camera_degC = session.readings("camera.temperature")
     bad_ns = times_ns[camera_degC != camera_degC]
     assert 55 <= (held.time_ns - bad_ns[0]) / NS_PER_S <= 75
-    assert [meta.camera_degC > 20 for _, meta in session.frame_metas] == [True] * 4
+    assert [meta.camera_degC > 20 for meta in session.frame_metas()] == [True] * 4
     for command, place in (("list", directory.parent), ("verify", directory), ("info", directory)):
         assert "no frame has" not in CliRunner().invoke(app, ["session", command, str(place)]).stdout
 

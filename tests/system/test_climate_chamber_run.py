@@ -76,7 +76,7 @@ async def test_a_stand_with_a_commercial_chamber_needs_no_relay_board(
     _, pv_degC = session.readings("regulator.pv")
     assert max(pv_degC) > 25
     assert session.readings("regulator.running")[1][-1] == 0
-    assert len(session.frame_metas) == 3
+    assert len(session.frame_metas()) == 3
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ async def test_a_prompt_that_somebody_attends_to_holds_the_run(
     assert counted["held"] == counted["released"] == counted["continued"] == int(attended)
     if attended:
         assert kinds.index("prompt") < kinds.index("held") < kinds.index("released") < kinds.index("prompt done")
-    assert len(session.frame_metas) == 2
+    assert len(session.frame_metas()) == 2
 
 
 def test_nothing_is_superseded_in_a_run_that_was_not_interrupted(tmp_path: Path, order: Callable[..., Order]):
@@ -183,8 +183,8 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_again_from_a_cold_cam
     begins_ns = begins_of(session.events())
     (restart,) = [event for event in session.events() if event.kind == "capture_restarted"]
     assert begins_ns == {capture.step_id: restart.time_ns}
-    counted = [meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]
-    superseded = len(session.frame_metas) - 8
+    counted = [meta for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)]
+    superseded = len(session.frame_metas()) - 8
     assert superseded >= 3
     assert f"its {superseded} frames so far do not count" in restart.text
     assert len(counted) == 8
@@ -224,10 +224,10 @@ async def test_a_warm_up_that_is_paused_shortly_goes_on_and_says_what_was_not_se
 ):
     ordered = order(WARM_UP.replace("band_K: 2", "cool_down_max_s: 10").replace("interval_s: 30", "interval_s: 5"))
     session = await paused(ordered, tmp_path / "out", 35.0)
-    assert len(session.frame_metas) == 8
+    assert len(session.frame_metas()) == 8
     (gap,) = [event for event in session.events() if event.kind == "warm_up_gap"]
     missing_s = float(gap.text.split(" for ")[1].split()[0])
-    times_ns = [time_ns for time_ns, _ in session.frame_metas]
+    times_ns = [meta.time_ns for meta in session.frame_metas()]
     gaps_s = [(later - time_ns) / NS_PER_S for time_ns, later in itertools.pairwise(times_ns)]
     assert missing_s == pytest.approx(max(gaps_s), abs=1.0)
     assert missing_s > 35.0
@@ -240,12 +240,12 @@ async def test_a_warm_up_that_is_paused_for_long_begins_again_from_its_cool_down
     ordered = order(WARM_UP, **AS_INSTALLED)
     session = await paused(ordered, tmp_path / "out", 100.0)
     begins_ns = begins_of(session.events())
-    counted = [meta for time_ns, meta in session.frame_metas if not is_superseded(time_ns, meta.step_id, begins_ns)]
+    counted = [meta for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)]
     assert len(counted) == 8
     held_ns = next(event.time_ns for event in session.events() if event.kind == "held")
-    before = [time_ns for time_ns, _ in session.frame_metas if time_ns < held_ns + NS_PER_S]  # one is exposed meanwhile
+    before = [meta.time_ns for meta in session.frame_metas() if meta.time_ns < held_ns + NS_PER_S]
     assert len(before) >= 3  # more on a busy machine: virtual time goes on until the pause is there
-    assert len(session.frame_metas) == 8 + len(before)
+    assert len(session.frame_metas()) == 8 + len(before)
     assert counted[0].camera_degC < 27.0
     cooled = [mark for mark in session.steps() if mark.kind == "cool_down" and mark.state is StepState.DONE]
     assert len(cooled) == 2

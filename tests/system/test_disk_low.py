@@ -43,7 +43,7 @@ async def test_a_disk_that_fills_during_a_capture_holds_it_and_costs_no_frame(
     memory: Path, order: Callable[..., Order]
 ):
     limit_GB = shutil.disk_usage(memory).free / 1e9 - ROOM_GB
-    ordered = order(RECIPE, recording={"stop_frames_below_GB": limit_GB, "frame_encoding": "png"})
+    ordered = order(RECIPE, recording={"stop_frames_below_GB": limit_GB, "frame_encoding": "zstd"})
     ballast, frames, kinds = memory / "ballast", list[int](), list[str]()
 
     def follow(item: Item) -> None:

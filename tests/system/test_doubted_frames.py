@@ -55,7 +55,7 @@ async def test_frames_of_a_camera_that_is_wrong_at_each_capture_say_so(tmp_path:
 
     path = await run_virtual(ordered, tmp_path / "out", None, watch)
     session = Session.open(path)
-    flags = [(meta.step_id != captures[0], meta.flags) for _, meta in session.frame_metas]
+    flags = [(meta.step_id != captures[0], meta.flags) for meta in session.frame_metas()]
     assert [flag for is_wrong, flag in flags if not is_wrong] == [()]
     assert {flag for is_wrong, flag in flags if is_wrong} == {(TEMPERATURE_IN_DOUBT,)}
     count = sum(is_wrong for is_wrong, _ in flags)

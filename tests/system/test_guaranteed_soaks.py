@@ -79,7 +79,7 @@ async def test_a_soak_goes_on_until_the_chamber_was_in_its_band_for_the_last_thi
         (end_ns - begin_ns) / 1e9 - 330.0, abs=2.0
     )
     assert events_of(session, "soak_unsettled") == []
-    assert [meta.flags for _, meta in session.frame_metas] == [(), ()]
+    assert [meta.flags for meta in session.frame_metas()] == [(), ()]
 
 
 @pytest.mark.parametrize("soak", ["600", "{duration_s: 150, band_K: 0}"])
@@ -90,7 +90,7 @@ async def test_a_soak_in_a_good_chamber_and_one_without_a_band_take_their_time(
     begin_ns, end_ns = last_soak_ns(session)
     assert (end_ns - begin_ns) / 1e9 == pytest.approx(600.0 if soak == "600" else 150.0, abs=1.0)
     assert events_of(session, "soak_longer") == []
-    assert [meta.flags for _, meta in session.frame_metas] == [(), ()]
+    assert [meta.flags for meta in session.frame_metas()] == [(), ()]
 
 
 async def test_after_its_longest_the_frames_are_marked_and_a_fit_leaves_them_out(
@@ -104,7 +104,7 @@ async def test_after_its_longest_the_frames_are_marked_and_a_fit_leaves_them_out
     assert (end_ns - begin_ns) / 1e9 == pytest.approx(150.0, abs=1.0)
     assert off_K(session, end_ns - 10_000_000_000, end_ns) > BAND_K
     assert [event.level for event in events_of(session, "soak_unsettled")] == ["warning"]
-    assert [meta.flags for _, meta in session.frame_metas] == [(), (UNSETTLED,)]
+    assert [meta.flags for meta in session.frame_metas()] == [(), (UNSETTLED,)]
     assert observe(path).left_out == {"the chamber was not in its band when the soak before it ended": 1}
 
 
@@ -116,8 +116,8 @@ async def test_a_frame_is_marked_while_the_chamber_is_out_of_its_band(tmp_path: 
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, unwatched))
     times_ns, pv_degC = session.readings("regulator.pv")
     marked = list[bool]()
-    for frame_ns, meta in session.frame_metas[1:]:
-        off_K = abs(float(pv_degC[max(0, np.searchsorted(times_ns, frame_ns) - 1)]) - 34.0)
+    for meta in session.frame_metas()[1:]:
+        off_K = abs(float(pv_degC[max(0, np.searchsorted(times_ns, meta.time_ns) - 1)]) - 34.0)
         if abs(off_K - BAND_K) > 0.25:  # what it moves between a poll and an exposure
             assert (meta.flags == (UNSETTLED,)) is (off_K > BAND_K)
             marked.append(off_K > BAND_K)
@@ -139,7 +139,7 @@ async def test_a_run_that_is_interrupted_while_a_soak_goes_on_ends_it_in_the_ban
     session = Session.open(await resume(interruption(directory), unwatched))
     _, end_ns = last_soak_ns(session)
     assert off_K(session, end_ns - 110_000_000_000, end_ns) <= BAND_K
-    assert [meta.flags for _, meta in session.frame_metas] == [(), ()]
+    assert [meta.flags for meta in session.frame_metas()] == [(), ()]
 
 
 async def test_a_soak_that_may_not_end_unsettled_holds_the_run_and_begins_anew_when_cleared(
@@ -152,4 +152,4 @@ async def test_a_soak_that_may_not_end_unsettled_holds_the_run_and_begins_anew_w
     assert 1 <= len(operator.holds) <= 3
     _, end_ns = last_soak_ns(session)
     assert off_K(session, end_ns - 80_000_000_000, end_ns) <= BAND_K
-    assert [meta.flags for _, meta in session.frame_metas] == [(), ()]
+    assert [meta.flags for meta in session.frame_metas()] == [(), ()]

@@ -4,12 +4,12 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import pytest
 from typer.testing import CliRunner, Result
 
 from tests.system.conftest import require_aravis
 from tests.system.test_check import laboratory
-from thermostand.recording.format.images import decode_png
 from thermostand.stand.commands.order_cli import app
 from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.running.order import Order
@@ -40,7 +40,7 @@ def test_devices_are_operated_by_hand_and_left_safe(tell: Callable[..., Result],
     assert json.loads(tell("flap", "open", "open_s=0.1").stdout)[0]["value"] == pytest.approx(1, abs=0.05)
     picture = tmp_path / "frame.png"
     found = json.loads(tell("camera", "grab", "flap=open", "-o", picture).stdout)
-    image, _ = decode_png(picture.read_bytes())
+    image = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
     assert (found["mean_grey"], image.shape) == (round(float(image.mean()), 2), (found["height_px"], found["width_px"]))
     assert found["brightest"] > 100
     state = laboratory(tmp_path / "config.yaml", {"do": "state"})

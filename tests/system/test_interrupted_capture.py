@@ -104,12 +104,8 @@ async def interrupted(order: Order, out: Path, interrupter: Interrupter) -> Sess
 
 def counted_ns(session: Session) -> list[int]:
     """Instants of the frames that count."""
-    begins_ns, on_disk = begins_of(session.events()), set(session.frame_times_ns.tolist())
-    return [
-        time_ns
-        for time_ns, meta in session.frame_metas
-        if time_ns in on_disk and not is_superseded(time_ns, meta.step_id, begins_ns)
-    ]
+    begins_ns = begins_of(session.events())
+    return [m.time_ns for m in session.frame_metas() if not is_superseded(m.time_ns, m.step_id, begins_ns)]
 
 
 def check_again(session: Session, order: Order) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.damage import names, read_segment
-from tests.system.recording_process import MESSAGES_PER_ROUND, frame_records, nursery, telemetry_records
+from tests.system.recording_process import MESSAGES_PER_ROUND, frame_records, images_in, nursery, telemetry_records
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session, salvage_unfinished
@@ -37,7 +37,7 @@ def test_nothing_acknowledged_is_missing_after_kill_9(tmp_path, start, kills):
         left |= {Path(name).suffix for name in names(directory)}
         salvage_unfinished(directory.parent)
 
-        frames, telemetry = read_series(directory, FRAMES), read_series(directory, TELEMETRY)
+        frames, telemetry = images_in(read_series(directory, FRAMES)), read_series(directory, TELEMETRY)
         assert frames == frame_records(len(frames))
         assert telemetry == telemetry_records(last.rounds + 1)[: len(telemetry)]
         assert len(frames) >= max(last.frames, last.rounds - 1)

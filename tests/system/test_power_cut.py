@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from tests.system.recording_process import frame_records, nursery, telemetry_records
+from tests.system.recording_process import frame_records, images_in, nursery, telemetry_records
 from tests.system.test_kill_recording import read_series
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
@@ -73,6 +73,7 @@ def power_cut(start, tmp_path, name, wait_s, synced=False):
             last = recording.kill()
     frames, telemetry, control = read_after_cut(after, tmp_path / f"after-{name}")
     after.unlink()
+    frames = images_in(frames)
     assert frames == frame_records(len(frames))
     assert telemetry == telemetry_records(last.rounds + 1)[: len(telemetry)]
     assert len(frames) >= last.frames

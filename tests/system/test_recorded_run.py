@@ -47,7 +47,7 @@ async def test_roi_keeps_the_markers_and_a_whole_frame_of_each_capture(tmp_path:
     observed = observe_session(session, session_target(session))
     assert observed.usable.all()
     assert not np.isnan(observed.centres_px).any()
-    sizes = [len(image.data) for image in session.images()]
+    sizes = [image.stored_bytes for image in session.images()]
     assert max(sizes[1], sizes[2], sizes[4]) < min(sizes[0], sizes[3]) / 4
 
 

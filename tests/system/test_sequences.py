@@ -93,9 +93,8 @@ def check_warm_up(session: Session) -> None:
     marks = [mark for mark in session.steps() if mark.kind == "cool_down"]
     waits_s = [(end.time_ns - begin.time_ns) / 1e9 for begin, end in zip(marks[::2], marks[1::2], strict=True)]
     assert waits_s[0] < 60.0 < waits_s[1]
-    metas = session.frame_metas
     begins = {begin.step_id for begin, _ in captures(session)[:2]}
-    own = [(time_ns, meta) for time_ns, meta in metas if meta.step_id in begins]
+    own = [(meta.time_ns, meta) for meta in session.frame_metas() if meta.step_id in begins]
     cold_degC = [own[0][1].camera_degC, own[3][1].camera_degC]
     assert max(cold_degC) < 26.0
     # At once: from the camera's start to its first frame no more than its boot.

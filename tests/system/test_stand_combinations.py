@@ -281,7 +281,7 @@ async def test_each_combination_runs_and_records_what_it_lacks(combination: Comb
     order = Order(configured(data), does, text, yaml.safe_dump({"name": "all", "steps": steps(data)}), TARGET)
     session = Session.open(await run_virtual(order, tmp_path / "out", 1, lambda _: None))
     assert session.run == "complete"
-    assert len(session.frame_metas) == len(data["cameras"])
+    assert len(session.frame_metas()) == len(data["cameras"])
     reported = [event.data["what"] for event in session.events() if event.kind == "absent"]
     assert reported == [each.what for each in absences(order.config)]
     air_degC = session.readings("thermometers.air")[1]

@@ -76,7 +76,7 @@ def build(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Orde
 async def test_a_window_a_camera_and_no_cold_is_a_stand(tmp_path: Path, build: Callable[..., Order]):
     ordered = build(bare, RECIPE + FRAMES)
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, lambda _: None))
-    assert len(session.frame_metas) == 2
+    assert len(session.frame_metas()) == 2
     assert [frame.image.mean() > 40 for frame in session.frames()] == [True, True]  # seen through the window
     reported = [event.data["what"] for event in session.events() if event.kind == "absent"]
     assert reported == ["flap", "stages", "compressor", "thermometer in the laboratory"]

@@ -30,7 +30,7 @@ def night(cameras: int, out: Path) -> tuple[float, Counter[str], int]:
     path = recorded(data, NIGHT, out)
     assert verify(path).files is Files.SOUND
     session = Session.open(path)
-    metas = [meta for _, meta in session.frame_metas]
+    metas = session.frame_metas()
     later = metas[cameras:]  # the simulated scene's first image is slow
     times_ns = session.readings("thermometers.air")[0]
     duration_s = float(times_ns[-1] - times_ns[0]) / 1e9

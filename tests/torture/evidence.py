@@ -218,12 +218,14 @@ class Evidence:
         is_of_frames = path.parent.name == "frames"
         try:
             with path.open("rb") as file:
-                reader = make_reader(file, decoder_factories=[] if is_of_frames else [DecoderFactory()])
+                reader = make_reader(file, decoder_factories=[DecoderFactory()])
+                topics = [channel.topic for channel in reader.get_summary().channels.values()]
                 if is_of_frames:
-                    self.frames.update((channel.topic, each.log_time) for _, channel, each in reader.iter_messages())
-                else:
-                    for _, channel, message, decoded in reader.iter_decoded_messages():
-                        self._take(channel.topic, message.log_time, decoded)
+                    images = reader.iter_messages([topic for topic in topics if topic.endswith("/image")])
+                    self.frames.update((channel.topic, each.log_time) for _, channel, each in images)
+                    topics = [topic for topic in topics if topic.endswith("/meta")]
+                for _, channel, message, decoded in reader.iter_decoded_messages(topics):
+                    self._take(channel.topic, message.log_time, decoded)
         except (McapError, OSError, ValueError) as error:
             self.unreadable.append(f"{path.parent.name}/{path.name}: {type(error).__name__}")
 

@@ -13,7 +13,12 @@ from thermostand.drivers.framing.aravis_library import AravisError
 from thermostand.drivers.settings import Identity
 from thermostand.drivers.wires.camera_connection import Connection, Shot
 from thermostand.drivers.wires.camera_errors import device_error, lacks_control
-from thermostand.drivers.wires.camera_settings import AravisCameraSettings, EffectiveSettings, GigeCameraSettings
+from thermostand.drivers.wires.camera_settings import (
+    AravisCameraSettings,
+    EffectiveSettings,
+    GigeCameraSettings,
+    significant_bits,
+)
 from thermostand.drivers.wires.frame_count import FrameCount
 from thermostand.foundation.calls import Lane, Result
 from thermostand.foundation.clock import Clock, seconds_ns
@@ -129,6 +134,7 @@ class Camera:
             block_id=shot.block_id,
             camera_ticks=shot.camera_ticks,
             dropped=shot.dropped,
+            significant_bits=significant_bits(self.settings.pixel_format),
         )
 
     async def read(self) -> tuple[Reading, ...]:

@@ -8,9 +8,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-
 from thermostand.foundation.instants import duration, local_text
 from thermostand.foundation.items import Event, StepState
 from thermostand.foundation.usage import one_line
@@ -25,7 +22,6 @@ from thermostand.stand.commands.sessions.session_table import entry_json, size
 WIDTH = 100
 _LABEL = 14
 _MOST = 20  # entries of a list before the rest is only counted
-ENCODING = {CompressedImage.DESCRIPTOR.full_name: "PNG", RawImage.DESCRIPTOR.full_name: "raw"}
 
 
 def info_lines(found: Overview) -> Iterator[str]:
@@ -149,9 +145,8 @@ def _frames(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     if not frames.count:
         yield from _row("frames", f"none{_lost(frames)}")
         return
-    encoding = ENCODING.get(frames.schema, frames.schema)
     each = size(round(frames.size_bytes / frames.count))
-    yield from _row("frames", f"{frames.count}, {frames.pixels}, {encoding}, {each} each{_lost(frames)}")
+    yield from _row("frames", f"{frames.count}, {frames.pixels}, {each} each{_lost(frames)}")
     if frames.first_ns is not None and frames.last_ns is not None:
         yield from _row("", f"from {utc.date_time(frames.first_ns)} to {utc.local_text(frames.last_ns)}")
     captures = [step for step in found.steps if step.frames]
@@ -165,8 +160,6 @@ def _lost(frames: Frames) -> str:
     if frames.lost_by_recorder:
         parts.append(f"{frames.lost_by_recorder} lost by the recorder")
     parts += [f"{count} flagged {flag}" for flag, count in sorted(frames.flagged.items())]
-    if frames.described != frames.count:
-        parts.append(f"{frames.described} are described in the telemetry")
     return "".join(f"; {part}" for part in parts)
 
 
