@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
-from thermostand.drivers.devices.in_force import InForce
 from thermostand.drivers.settings import CameraSettings, Identity
 from thermostand.foundation.readings import Frame, Reading
 
@@ -46,6 +46,20 @@ class Actuator(Device, Protocol):
     async def make_safe(self) -> None:
         """Bring it to its safe state, now; raises DeviceError when that could not be confirmed."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class InForce:
+    """Whether the set-point that was written is the one that acts: what a controller says of it. It can be written and
+    read back and yet not be what the unit goes to: another set-point bank, a remote set-point, a sensor outside, a
+    program, a ramp, an operator at the panel, degrees Fahrenheit.
+
+    known_by: the registers or queries that tell it; "" when none does. not_told: what they leave open; "" for
+    nothing. objections: a sentence for each thing that acts in its place, with what to do; () while it is in force."""
+
+    known_by: str
+    not_told: str = ""
+    objections: tuple[str, ...] = ()
 
 
 class Controller(Sensor, Actuator, Protocol):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import difflib
 import importlib.resources
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self, cast
 
@@ -24,7 +24,8 @@ from pydantic import (
 
 from thermostand.drivers.camera_preset import CameraPreset
 from thermostand.drivers.devices.cameras.cameras_by_protocol import AnyCameraSettings
-from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
+from thermostand.drivers.devices.chambers.chamber_language import ChamberUnitSettings
+from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamberSettings
 from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings
 from thermostand.drivers.devices.inputs import InputsSettings
 from thermostand.drivers.devices.kinds import Equipment, added_settings, built_in, equipment_of
@@ -35,7 +36,13 @@ from thermostand.drivers.devices.regulators.heat_module import HeatModuleSetting
 from thermostand.drivers.devices.regulators.pid import split
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from thermostand.drivers.devices.relays import HEAT, RelaysSettings
-from thermostand.drivers.devices.thermometers import ThermometerModuleSettings, ThermometerSettings, by_channel
+from thermostand.drivers.devices.thermometers import (
+    PLACES,
+    Role,
+    ThermometerModuleSettings,
+    ThermometerSettings,
+    by_channel,
+)
 from thermostand.drivers.settings import CameraSettings, DeviceName, Line, OnBus, Polled, ascending
 from thermostand.drivers.wires.bus import BusSettings
 from thermostand.experiments.parameters import Chamber_degC
@@ -46,7 +53,6 @@ from thermostand.stand.config.chamber_section import ChamberConfig
 from thermostand.stand.config.dew import DewConfig, EndingConfig
 from thermostand.stand.config.guard_section import GuardConfig
 from thermostand.stand.config.interface_section import InterfaceConfig
-from thermostand.stand.config.roles import unfit_roles, witnesses
 from thermostand.stand.config.safe_ranges import check, outside
 from thermostand.stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
 
@@ -178,7 +184,7 @@ class StandConfig(Document):
 
     def _faults(self) -> Iterator[str]:
         """What of one section does not fit another."""
-        yield from unfit_roles(self.thermometers)
+        yield from _unfit_roles(self.thermometers)
         yield from self._unfit_control()
         yield from self._unfit_devices()
         yield from self._unfit_limits()
@@ -304,7 +310,7 @@ class StandConfig(Document):
         """The thermometers that show when the regulator's probe and the air's are wrong alike."""
         regulator = self.regulator
         controlling = regulator.thermometer if isinstance(regulator, SoftwareRegulatorSettings) else ""
-        return witnesses(self.thermometers, controlling)
+        return _witnesses(self.thermometers, controlling)
 
     @property
     def set_points_degC(self) -> tuple[float, float]:
@@ -350,6 +356,34 @@ class StandConfig(Document):
     def camera(self) -> CameraSettings | None:
         """The leading camera: soaks, cool-downs and models go by its temperature. None on a stand without cameras."""
         return self.cameras.get(LEADING)
+
+
+GUARDED: tuple[Role, ...] = ("air",)  # without which nothing is heated
+
+
+def _witnesses(thermometers: Mapping[str, ThermometerSettings], controlling: str = "") -> list[str]:
+    """The thermometers by which the guard finds that the regulator's probe and the air's are wrong alike: the granite
+    inside, which follows the air, and safety ones; not the one that `controlling` names."""
+    sensors = by_channel(thermometers)
+    return [
+        name for name, each in sensors.items() if (name == "granite_inside" or each.is_safety) and name != controlling
+    ]
+
+
+def _unfit_roles(thermometers: Mapping[str, ThermometerSettings]) -> Iterator[str]:
+    """A sentence for each role that nobody has, that two have, or that another name belies."""
+    places = [each.role or name for name, each in thermometers.items()]
+    for place in PLACES:
+        if places.count(place) > 1:
+            yield f"thermometers: two of them have the role {place}; one place is one thermometer's"
+    for name, each in thermometers.items():
+        if name in PLACES and each.role not in (None, name):
+            yield f"thermometers.{name} has the role {each.role}; give it another name, or the role {name}"
+    if missing := [place for place in GUARDED if place not in by_channel(thermometers)]:
+        yield (
+            f"thermometers lacks {', '.join(missing)}, without which nothing is heated; name one so, or give one "
+            f"`role: {missing[0]}`"
+        )
 
 
 def load_config(path: Path) -> StandConfig:

@@ -15,7 +15,9 @@ from thermostand.drivers.devices.chambers import (
     chamber_julabo,
     chamber_simserv,
 )
-from thermostand.drivers.devices.chambers.chamber_settings import Ascii2Settings, CtsSettings, EspecSettings
+from thermostand.drivers.devices.chambers.chamber_ascii2 import Ascii2Settings
+from thermostand.drivers.devices.chambers.chamber_cts import CtsSettings
+from thermostand.drivers.devices.chambers.chamber_espec import EspecSettings
 from thermostand.drivers.devices.probes import Probe, ProbeSettings
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.foundation.clock import WallClock

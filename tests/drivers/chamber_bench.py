@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings, ClimateChamberSettings
-from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamber
+from thermostand.drivers.devices.chambers.chamber_language import ChamberUnitSettings
+from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamber, ClimateChamberSettings
 from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss

@@ -2,7 +2,7 @@
 
 import pytest
 
-from thermostand.drivers.devices.motion.flap_travel import Travel
+from thermostand.drivers.devices.motion.flap import Travel
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 
 Look = tuple[float, int, bool]  # s since the target was sent, position, saturated

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from thermostand.drivers.devices.in_force import InForce
+from thermostand.drivers.devices.protocols import InForce
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.drivers.settings import CameraSettings, Identity
 from thermostand.foundation.clock import VirtualClock, seconds_ns

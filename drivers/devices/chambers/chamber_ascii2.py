@@ -10,9 +10,11 @@ counts is what is read afterwards. `$01?` describes the fields of a unit, its li
 from __future__ import annotations
 
 import re
+from typing import Annotated, Literal, Self
 
-from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
-from thermostand.drivers.devices.chambers.chamber_settings import Ascii2Settings
+from pydantic import Field, model_validator
+
+from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, ChamberUnitSettings
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import Unreachable
 
@@ -35,6 +37,38 @@ def parse(heard: bytes) -> tuple[list[float], str] | None:
 def number(value: float) -> str:
     """0025.0, -040.0."""
     return f"{value:06.1f}"
+
+
+class Ascii2Settings(ChamberUnitSettings):
+    """Weiss and Voetsch (SIMPAC, SIMCON/32): ASCII-2 on RS-232/485 or TCP (port 2049). What a field means differs from
+    unit to unit: `$01?` describes it.
+
+    write_fields: the fields of the reply, from 0, that a write command takes, in its order. order: of each pair of the
+    reply. start_bit, off_bits: digital channels, from 0; the off_bits (humidity, condensation) are set to 0 at each
+    start. shows_ramp: the nominal value in the reply moves with a ramp ("show target set-point").
+    """
+
+    protocol: Literal["ascii2"]
+    unit: int = Field(default=1, ge=0, le=31)
+    baud: int = Field(default=9600, ge=1200, le=115200)
+    order: Literal["nominal_actual", "actual_nominal"] = "nominal_actual"
+    write_fields: tuple[Annotated[int, Field(ge=0, le=63)], ...] = (0, 2, 4, 6, 8, 10, 12)
+    start_bit: int = Field(default=1, ge=0, le=31)
+    off_bits: tuple[Annotated[int, Field(ge=0, le=31)], ...] = (2,)
+    shows_ramp: bool = False
+    gap_s: float = Field(default=0.5, ge=0, le=5)  # other drivers pause as long
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        if self.start_bit in self.off_bits:
+            raise ValueError(f"start_bit {self.start_bit} is one of off_bits, too")
+        nominal = 0 if self.order == "nominal_actual" else 1
+        if not self.write_fields or self.write_fields[0] != nominal:
+            raise ValueError(f"write_fields has to begin with {nominal}, the nominal temperature")
+        return self
+
+
+Settings = Ascii2Settings
 
 
 class Language(ChamberLanguage):

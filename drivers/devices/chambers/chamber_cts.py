@@ -13,10 +13,16 @@ import re
 from collections.abc import Callable, Iterator
 from functools import reduce
 from operator import xor
-from typing import TypeVar
+from typing import Literal, TypeVar
 
-from thermostand.drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
-from thermostand.drivers.devices.chambers.chamber_settings import CtsSettings
+from pydantic import Field
+
+from thermostand.drivers.devices.chambers.chamber_language import (
+    PROGRAM,
+    ChamberLanguage,
+    ChamberState,
+    ChamberUnitSettings,
+)
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import Refused
 
@@ -46,6 +52,24 @@ def unframed(unit: int, heard: bytes) -> str | None:
     if body[0] != _HIGH | unit:
         raise ValueError(f"unit {body[0] & 0x7F} has answered, not {unit}")
     return bytes(byte & 0x7F for byte in body[1:]).decode("latin-1")
+
+
+class CtsSettings(ChamberUnitSettings):
+    """CTS (ITC, Cadimac): framed ASCII on RS-232 (19200 8O1), bare text over TCP (port 1080). door_reply: how many
+    characters this unit's reply to O has, whose flags tell whether its door is closed; none: it is not asked.
+    program_reply, ramp_reply: the same of P, the number of the program that runs, and of R1, its ramp, whose length no
+    manual at hand states."""
+
+    protocol: Literal["cts"]
+    unit: int = Field(default=1, ge=1, le=32)
+    baud: int = Field(default=19200, ge=1200, le=115200)
+    parity: Literal["N", "E", "O"] = "O"
+    door_reply: int | None = Field(default=None, ge=5, le=64)
+    program_reply: int | None = Field(default=4, ge=2, le=8)
+    ramp_reply: int | None = Field(default=None, ge=6, le=64)
+
+
+Settings = CtsSettings
 
 
 class Language(ChamberLanguage):

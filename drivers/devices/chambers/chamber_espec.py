@@ -8,9 +8,17 @@ TEMP, S23.0           OK:TEMP, S23.0           NA:DATA OUT OF RANGE, NA:PROTECT 
 from __future__ import annotations
 
 import re
+from typing import Literal
 
-from thermostand.drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState, whole_line
-from thermostand.drivers.devices.chambers.chamber_settings import EspecSettings
+from pydantic import Field
+
+from thermostand.drivers.devices.chambers.chamber_language import (
+    PROGRAM,
+    ChamberLanguage,
+    ChamberState,
+    ChamberUnitSettings,
+    whole_line,
+)
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import GarbledReply, Refused
 
@@ -25,6 +33,19 @@ def _numbers(text: str, count: int) -> list[float]:
     if len(fields) != count or not all(_NUMBER.fullmatch(field) for field in fields):
         raise ValueError(f"expected {count} numbers")
     return [float(field) for field in fields]
+
+
+class EspecSettings(ChamberUnitSettings):
+    """ESPEC P300, SCP-220 and their relatives: ASCII lines. unit: of an RS-485 line, none for RS-232 and TCP (port
+    10001). quick_timer: a timer of the chamber that stops it 10 min after the last renewal, unverified on a unit."""
+
+    protocol: Literal["espec"]
+    unit: int | None = Field(default=None, ge=1, le=16)
+    baud: int = Field(default=19200, ge=1200, le=115200)
+    quick_timer: bool = False
+
+
+Settings = EspecSettings
 
 
 class Language(ChamberLanguage):

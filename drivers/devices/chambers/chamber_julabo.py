@@ -11,9 +11,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import Literal
 
-from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, whole_line
-from thermostand.drivers.devices.chambers.chamber_settings import JulaboSettings
+from pydantic import Field
+
+from thermostand.drivers.devices.chambers.chamber_language import (
+    ChamberLanguage,
+    ChamberState,
+    ChamberUnitSettings,
+    whole_line,
+)
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import GarbledReply, Refused, Unreachable
 
@@ -53,6 +60,26 @@ def status_of(heard: bytes) -> tuple[str, str] | None:
     if (found := _STATUS.fullmatch(line)) is None:
         raise ValueError("expected two digits and a message")
     return found[1], found[2]
+
+
+class JulaboSettings(ChamberUnitSettings):
+    """A Julabo circulator or temperature system whose bath holds the chamber: RS-232 (older ones 4800 7E1), USB or TCP.
+    Its set-point is the bath's, not the air's. asks_bank, asks_control, asks_unit: whether in_mode_01 (which working
+    temperature acts), in_mode_04 (whether a sensor outside is controlled) and in_sp_06 are asked. in_sp_06 is the unit
+    of temperatures on some FP51-SL only (0 degC, 1 degF); on a unit where it is another value that may be a bare 1, do
+    not ask."""
+
+    protocol: Literal["julabo"]
+    baud: int = Field(default=4800, ge=1200, le=115200)
+    parity: Literal["N", "E", "O"] = "E"
+    databits: Literal[7, 8] = 7
+    gap_s: float = Field(default=0.25, ge=0, le=5)  # asked for by the manuals
+    asks_bank: bool = True
+    asks_control: bool = True
+    asks_unit: bool = True
+
+
+Settings = JulaboSettings
 
 
 class Language(ChamberLanguage):

@@ -5,9 +5,24 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings
+from pydantic import Field
+
+from thermostand.drivers.settings import Line, Polled, Range
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.addresses import ByteAddress
+
+
+class ChamberUnitSettings(Polled):
+    """What the chambers have in common. address: `serial:PATH` or `tcp:HOST:PORT`. identity: text that must be in what
+    the unit says of itself; "" accepts any. limits_at_panel_degC: the set-point limits that somebody has set at the
+    panel, for a make that does not tell them. timeout_s, gap_s: real seconds for a reply, and between two requests."""
+
+    address: ByteAddress
+    identity: Line = ""
+    limits_at_panel_degC: Range | None = None
+    timeout_s: float = Field(default=1.0, gt=0, le=10)
+    gap_s: float = Field(default=0.1, ge=0, le=5)
 
 
 @dataclass(frozen=True, slots=True)

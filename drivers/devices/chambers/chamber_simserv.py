@@ -8,10 +8,18 @@ command but 10010.
 from __future__ import annotations
 
 import re
+from typing import Annotated, Literal, Self
 
-from thermostand.drivers.devices.chambers.chamber_language import PROGRAM, ChamberLanguage, ChamberState
-from thermostand.drivers.devices.chambers.chamber_settings import SimservSettings
+from pydantic import Field, model_validator
+
+from thermostand.drivers.devices.chambers.chamber_language import (
+    PROGRAM,
+    ChamberLanguage,
+    ChamberState,
+    ChamberUnitSettings,
+)
 from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.addresses import ByteAddress
 from thermostand.foundation.errors import GarbledReply, Refused
 
 _MARK = "\xb6"  # a byte of Latin-1, not of UTF-8
@@ -41,6 +49,28 @@ def reply_of(heard: bytes) -> tuple[str, list[str]] | None:
     if not (code == "1" or (_REFUSAL.fullmatch(code) and not values)):
         raise ValueError("expected 1 and its values, or a negative code")
     return code, values
+
+
+class SimservSettings(ChamberUnitSettings):
+    """Weiss and Voetsch with SIMPAC or LabEvent: SIMSERV over TCP (port 2049). chamber: its number there.
+    start_channel, off_channels: digital channels, as `14001` counts them; the off_channels (humidity, condensation) are
+    set to 0 at each start. allows_gradient: one that is set at the unit is wanted; it is not asked for then."""
+
+    protocol: Literal["simserv"]
+    address: Annotated[ByteAddress, Field(pattern="^tcp:")]
+    chamber: int = Field(default=1, ge=1, le=99)
+    start_channel: int = Field(default=1, ge=0, le=99)
+    off_channels: tuple[Annotated[int, Field(ge=0, le=99)], ...] = ()
+    allows_gradient: bool = False
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        if self.start_channel in self.off_channels:
+            raise ValueError(f"start_channel {self.start_channel} is one of off_channels, too")
+        return self
+
+
+Settings = SimservSettings
 
 
 class Language(ChamberLanguage):

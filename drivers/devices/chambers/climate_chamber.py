@@ -7,15 +7,18 @@ on at its last set-point. So the limits of its own controller are part of what i
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from collections.abc import Callable
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Union, cast
 
-from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState
-from thermostand.drivers.devices.chambers.chamber_settings import ChamberUnitSettings
+from pydantic import Field
+
+import thermostand.drivers.devices.chambers
+from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, ChamberUnitSettings
 from thermostand.drivers.devices.checking import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
-from thermostand.drivers.devices.in_force import InForce
 from thermostand.drivers.devices.kinds import CONTROL, Around, DeviceKind
+from thermostand.drivers.devices.protocols import InForce
 from thermostand.drivers.settings import Identity, same_device
 from thermostand.foundation.calls import Lane, Result
 from thermostand.foundation.clock import Clock, call_pause_s, seconds_ns
@@ -27,7 +30,28 @@ _RENEW_S = 60.0
 
 
 class _Module(Protocol):
-    def Language(self, name: str, settings: ChamberUnitSettings) -> ChamberLanguage: ...
+    Settings: type[ChamberUnitSettings]
+
+    def Language(self, name: str, settings: Any) -> ChamberLanguage: ...
+
+
+def _found() -> dict[str, _Module]:
+    """The languages: a file of each, beside this one, has `Language` and `Settings`, whose protocol is its name."""
+    names = sorted(module.name for module in pkgutil.iter_modules(thermostand.drivers.devices.chambers.__path__))
+    modules = {
+        name.removeprefix("chamber_"): importlib.import_module(f"thermostand.drivers.devices.chambers.{name}")
+        for name in names
+        if name.startswith("chamber_")
+    }
+    return {name: cast("_Module", module) for name, module in modules.items() if hasattr(module, "Language")}
+
+
+LANGUAGES = _found()
+if TYPE_CHECKING:
+    ClimateChamberSettings = ChamberUnitSettings
+else:
+    _any_of_them = Union[tuple(language.Settings for language in LANGUAGES.values())]  # noqa: UP007 - of a tuple
+    ClimateChamberSettings = Annotated[_any_of_them, Field(discriminator="protocol")]
 
 
 class ClimateChamber:
@@ -47,8 +71,7 @@ class ClimateChamber:
         self._settings = settings
         self._allowed_degC = allowed_degC
         self._clock = clock
-        protocol = settings.model_dump()["protocol"]
-        module = cast("_Module", importlib.import_module(f"thermostand.drivers.devices.chambers.chamber_{protocol}"))
+        module = next(language for language in LANGUAGES.values() if type(settings) is language.Settings)
         gap_s = call_pause_s(clock, settings.gap_s)
         self._language = module.Language(name, settings.model_copy(update={"gap_s": gap_s}))
         self.dead_man = self._language.dead_man

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from thermostand.drivers.devices.checking import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
-from thermostand.drivers.devices.in_force import InForce
 from thermostand.drivers.devices.kinds import CONTROL, Around, DeviceKind
+from thermostand.drivers.devices.protocols import InForce
 from thermostand.drivers.settings import Identity, OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import CONFIRM_LOOKS, ModbusUnit, Sample, Snapshot, is_confirmed, objection

@@ -16,9 +16,8 @@ from typing import Literal, cast
 from pydantic import Field
 
 from thermostand.drivers.devices.checking import Look
-from thermostand.drivers.devices.in_force import InForce
 from thermostand.drivers.devices.kinds import CONTROL, Arguments, Around, DeviceKind, Hands, Verb
-from thermostand.drivers.devices.protocols import HeatOutput, Switches
+from thermostand.drivers.devices.protocols import HeatOutput, InForce, Switches
 from thermostand.drivers.devices.regulators import pid, relay_tuning
 from thermostand.drivers.devices.regulators.heat_module import HeatModule
 from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings
