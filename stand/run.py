@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import itertools
 import os
 from collections.abc import AsyncGenerator, Awaitable, Callable, Generator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, nullcontext, suppress
@@ -82,27 +83,21 @@ def rehearsed(order: Order) -> Order:
     if strange := sorted(config.axes.keys() - there.axes.keys()):
         known = ", ".join(there.axes)
         raise ConfigError(f"{config.name}: the simulated laboratory has no axis {strange[0]}, only {known}")
-    update: dict[str, Any] = {
+    ports = itertools.count(_FIRST_PORT)
+    changed: dict[str, Any] = {}
+    for name, kind, settings in (each for each in config.equipment if each.settings is not None):
+        if isinstance(settings, OnBus):
+            changed[name] = settings.model_copy(update={"registers": kind.simulated_map})
+        elif kind.section == "axes":
+            changed[name] = settings.model_copy(update={"address": there.axes[name].address})
+        elif kind.section == "cameras":
+            changed[name] = _camera(settings, there.cameras["camera"])
+        elif kind.section == "flap":
+            changed[name] = _flap(settings, there.flap)
+        elif hasattr(settings, "address"):
+            changed[name] = settings.model_copy(update={"address": f"tcp:127.0.0.1:{next(ports)}"})
+    update: dict[str, Any] = config.sections_with(changed) | {
         "bus": there.bus,
-        "regulator": _at(config.regulator_unit, "omron-e5cc") if config.regulator_unit else config.regulator,
-        "relays": config.relays and _at(config.relays, "waveshare-relay"),
-        "heat_module": config.heat_module and _at(config.heat_module, "icpdas-m7024"),
-        "climate_chamber": config.climate_chamber and config.climate_chamber.model_copy(update={"address": _CHAMBER}),
-        "thermometer_module": _at(config.thermometer_module, there.thermometer_module.registers),
-        "inputs": config.inputs and _at(config.inputs, "waveshare-inputs"),
-        "axes": {
-            name: axis.model_copy(update={"address": there.axes[name].address}) for name, axis in config.axes.items()
-        },
-        "probes": {
-            name: probe.model_copy(update={"address": f"tcp:127.0.0.1:{_PROBES + number}"})
-            for number, (name, probe) in enumerate(config.probes.items())
-        },
-        "devices": {
-            name: device.model_copy(update={"address": f"tcp:127.0.0.1:{_PROBES + len(config.probes) + number}"})
-            for number, (name, device) in enumerate(config.devices.items())
-        },
-        "flap": config.flap and _flap(config.flap, there.flap),
-        "cameras": {name: _camera(camera, there.cameras["camera"]) for name, camera in config.cameras.items()},
         "guard": config.guard.model_copy(update={"notify": ()}),
         "compressor": config.compressor.model_copy(update={"state_file": None}),
         "alerts": there.alerts,
@@ -113,12 +108,7 @@ def rehearsed(order: Order) -> Order:
     return with_register_maps(replace(order, config=rehearsal, config_text=text))
 
 
-_CHAMBER = "tcp:127.0.0.1:15023"
-_PROBES = 15024  # and on
-
-
-def _at(unit: OnBus, registers: str) -> OnBus:
-    return unit.model_copy(update={"registers": registers})
+_FIRST_PORT = 15023  # of what has a line of its own
 
 
 def _flap(own: FlapSettings, there: FlapSettings | None) -> FlapSettings:

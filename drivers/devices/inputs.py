@@ -112,5 +112,6 @@ KIND = DeviceKind(
     rank=40,
     is_opened=False,
     address_key="",
+    simulated_map="waveshare-inputs",
     check=_check,
 )

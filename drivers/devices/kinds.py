@@ -162,6 +162,8 @@ class DeviceKind:
     address_key: the setting that says where it answers, "" for a unit on the bus. stand_in: what is in its place on a
     stand without one, which is polled each stand_in_s, None for not at all. missing: what such a stand lacks. advise:
     what a person does about an error. check: what `stand check` looks at. verbs: what a person may tell it.
+    simulated_map: of a unit on the bus, the register map of the one in the simulated laboratory. asks_only: opening it
+    writes nothing.
     """
 
     name: str
@@ -179,6 +181,8 @@ class DeviceKind:
     advise: Callable[[DeviceError, str, Any], str] = _advise
     check: Callable[[Look], Coroutine[None, None, None]] = check_answers
     verbs: tuple[Verb, ...] = ()
+    simulated_map: str = ""
+    asks_only: bool = True
 
 
 class Equipment(NamedTuple):
@@ -212,7 +216,10 @@ def built_in() -> tuple[DeviceKind, ...]:
 
 
 def added_kind(name: str) -> DeviceKind:
-    """The kind that another package adds under that name; ConfigError when there is none, or it cannot be loaded."""
+    """The kind of that name without a section of its own, ours or another package's; ConfigError when there is none, or
+    it cannot be loaded."""
+    if ours := next((kind for kind in built_in() if (kind.name, kind.section) == (name, ADDED)), None):
+        return ours
     for point in entry_points(group=GROUP, name=name):
         package = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
         try:
@@ -244,7 +251,7 @@ def equipment_of(config: object, added: Mapping[str, Any]) -> tuple[Equipment, .
     """Every device that a stand's file has, in the order of their ranks, with stand-ins for those that it lacks. added:
     those of other packages, by name."""
     found = [Equipment(name, added_kind(settings.kind), settings) for name, settings in added.items()]
-    for kind in built_in():
+    for kind in (each for each in built_in() if each.section != ADDED):
         section = getattr(config, kind.section)
         named = cast("Mapping[str, Any]", {kind.device: section} if kind.device else section)
         found += [Equipment(name, kind, each) for name, each in named.items() if isinstance(each, kind.settings)]

@@ -232,6 +232,7 @@ KIND = DeviceKind(
     device="relays",
     rank=10,
     address_key="",
+    simulated_map="waveshare-relay",
     stand_in=NoRelays,
     stand_in_s=5.0,
     missing=Missing("relay board", "nothing of the stand's own ends the heat, and cameras stay on"),

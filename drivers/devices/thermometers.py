@@ -280,5 +280,6 @@ KIND = DeviceKind(
     device="thermometers",
     rank=30,
     address_key="",
+    simulated_map="icpdas-m7015",
     check=_check,
 )

@@ -12,6 +12,7 @@ from functools import partial
 
 from thermostand.drivers.devices.protocols import Controller
 from thermostand.drivers.devices.relays import CAMERA_POWER
+from thermostand.drivers.settings import OnBus
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
 from thermostand.drivers.wires.discovery import FoundCamera, cameras_at
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
@@ -56,18 +57,15 @@ async def _in_force(chamber: Controller) -> None:
 async def _of_bus(assembly: Assembly) -> tuple[Sequence[str], bool]:
     """Of the units that share a line, which are asked one after the other; and whether the cameras have their supply,
     as far as the relays tell."""
-    config, devices = assembly.config, assembly.devices
+    devices = assembly.devices
     if lacks := await _asked(assembly.bus.open):
         return lacks, False
-    probed = {"regulator": config.regulator_unit, "heat_module": config.heat_module}  # whose `open` would write
-    asks: list[Ask] = [
-        ModbusUnit(name, assembly.bus, register_map(name, unit)).probe
-        for name, unit in probed.items()
-        if unit is not None
-    ]
-    asks.append(devices.thermometers.open)
-    if devices.inputs is not None:
-        asks.append(devices.inputs.open)
+    asks: list[Ask] = []
+    for name, kind, settings in assembly.equipment:
+        if not isinstance(settings, OnBus) or kind.section == "relays":
+            continue
+        probe = ModbusUnit(name, assembly.bus, register_map(kind.section, settings)).probe
+        asks.append(devices.every[name].open if kind.asks_only else probe)
     lacks = [lack for ask in asks for lack in await _asked(ask)]
     try:
         await devices.relays.open()

@@ -9,7 +9,7 @@ import importlib.resources
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self, cast
+from typing import Annotated, Any, Literal, Self, cast
 
 from pydantic import (
     AfterValidator,
@@ -328,6 +328,16 @@ class StandConfig(Document):
     def equipment(self) -> tuple[Equipment, ...]:
         """Every device, in the order in which they are opened, and what is in the place of those that it lacks."""
         return equipment_of(self, self.devices)
+
+    def sections_with(self, changed: Mapping[str, Any]) -> dict[str, Any]:
+        """The sections, by their keys, with the settings of these devices, by name, in the place of their own."""
+        update: dict[str, Any] = {}
+        for name, kind, _ in self.equipment:
+            if name in changed and kind.device:
+                update[kind.section] = changed[name]
+            elif name in changed:
+                update.setdefault(kind.section, {**getattr(self, kind.section)})[name] = changed[name]
+        return update
 
     @property
     def units(self) -> dict[str, OnBus]:

@@ -359,5 +359,7 @@ KIND = DeviceKind(
     rank=15,
     is_opened=False,  # by the regulator that heats by it
     address_key="",
+    simulated_map="icpdas-m7024",
+    asks_only=False,
     check=_check,
 )

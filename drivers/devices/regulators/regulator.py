@@ -234,6 +234,8 @@ KIND = DeviceKind(
     device="regulator",
     rank=20,
     address_key="",
+    simulated_map="omron-e5cc",
+    asks_only=False,
     check=check_controller,
     verbs=CONTROL,
 )

@@ -86,18 +86,20 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
     simulated = own if own.simulation is not None else default_stand()
     notified = {"notify": own.guard.notify, "notify_limit_s": own.guard.notify_limit_s}
     maps = {
-        name: getattr(recorded, name).model_copy(update={"registers": getattr(simulated, name).registers})
-        for name in ("regulator", "relays", "thermometer_module")
-        if isinstance(getattr(recorded, name), OnBus) and isinstance(getattr(simulated, name), OnBus)
+        name: settings.model_copy(
+            update={
+                "registers": simulated.units[kind.section].registers
+                if kind.section in simulated.units
+                else kind.simulated_map
+            }
+        )
+        for name, kind, settings in recorded.equipment
+        if isinstance(settings, OnBus)
     }
-    if recorded.inputs is not None:
-        maps["inputs"] = recorded.inputs.model_copy(update={"registers": "waveshare-inputs"})
-    if recorded.heat_module is not None:
-        maps["heat_module"] = recorded.heat_module.model_copy(update={"registers": "icpdas-m7024"})
     state_file = {"state_file": simulated.compressor.state_file}
     return recorded.model_copy(
         update={
-            **maps,
+            **recorded.sections_with(maps),
             "guard": recorded.guard.model_copy(update=notified),
             "compressor": recorded.compressor.model_copy(update=state_file),
             "recording": recorded.recording.model_copy(update={"directory": own.recording.directory}),
