@@ -345,7 +345,7 @@ class StandService(Served):
     @command("/sessions/{session}/notes", has_verb=False, by_secop=None)
     async def note(self, who: Who, given: NoteRequest) -> str:
         """Add a note and tags to a session, running or finished."""
-        from thermostand.stand.running.said import Said, keep
+        from thermostand.stand.running.course import Said, keep
 
         said = Said(who, given.text, given.tags)
         await keep(said, *await self._notes_of(given.session), self.hub, self.clock)

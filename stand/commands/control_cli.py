@@ -68,7 +68,7 @@ def watch(server: Server) -> None:
     Example: stand watch
     """
     from thermostand.stand.watching.live import view
-    from thermostand.stand.watching.there import There
+    from thermostand.stand.watching.moment import There
 
     there = There(server)
     with suppress(KeyboardInterrupt):

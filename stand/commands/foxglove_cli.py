@@ -31,7 +31,7 @@ def foxglove(
         from thermostand.stand.watching.foxglove_live import HOST, Published
     except ModuleNotFoundError as error:
         raise ConfigError("it needs foxglove-sdk: pip install 'thermostand[foxglove]'") from error
-    from thermostand.stand.watching.there import There
+    from thermostand.stand.watching.moment import There
 
     there = There(server)
     try:

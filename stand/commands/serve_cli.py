@@ -30,14 +30,14 @@ from thermostand.stand.config.stand_config import StandConfig, load_config, pack
 from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.order import optics_texts
 from thermostand.stand.service import StandService
+from thermostand.stand.serving.api.access import TokenBook
 from thermostand.stand.serving.api.bridge import Bridge
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve as serve_clients
 from thermostand.stand.serving.api.server import try_doors
-from thermostand.stand.serving.api.token_book import TokenBook
 from thermostand.stand.serving.secop.door import door_at
 from thermostand.stand.serving.viewing import Viewing
-from thermostand.stand.watching.aside import aside
+from thermostand.stand.watching.live import aside
 from thermostand.stand.watching.remedies import next_command
 
 # SIGHUP to a daemon: its tokens are read again. From a terminal that is closed it ends the daemon, as SIGTERM does.

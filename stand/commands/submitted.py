@@ -20,8 +20,7 @@ from thermostand.stand.serving.client import API, Server
 from thermostand.stand.serving.desk import QueuedRun, StandState
 from thermostand.stand.serving.presence import living
 from thermostand.stand.watching.live import View, view
-from thermostand.stand.watching.moment import Moment
-from thermostand.stand.watching.there import There
+from thermostand.stand.watching.moment import Moment, There
 
 _LOOK_S = 0.5
 _QUEUE_LIMIT_S = 60.0  # the wires of the stand are asked when a run is queued

@@ -51,6 +51,7 @@ from thermostand.stand.queueing.orders import Orders, said_of
 from thermostand.stand.queueing.queue_file import Entry
 from thermostand.stand.queueing.queue_work import Halt, Notes, Stopped, Watch, drain, interruption_of, is_complete
 from thermostand.stand.run import run_in
+from thermostand.stand.running.course import keep
 from thermostand.stand.running.executing.settling_watch import load_for
 from thermostand.stand.running.guest import Guest, Job
 from thermostand.stand.running.opening.open_stand import OpenStand
@@ -58,7 +59,6 @@ from thermostand.stand.running.opening.stand_latch import LatchedFault
 from thermostand.stand.running.opening.stop import STOPPED, Stop, catch_signals
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
 from thermostand.stand.running.resume import Interruption, repaired
-from thermostand.stand.running.said import keep
 from thermostand.stand.service import StandService
 from thermostand.stand.serving.desk import Conflict, DeviceState, HeatByHand, Who
 

@@ -24,11 +24,11 @@ from thermostand.stand.queueing import queue
 from thermostand.stand.queueing.queue import Asked
 from thermostand.stand.queueing.queue_file import Entry, Queue, State, worked_on
 from thermostand.stand.queueing.queue_work import is_complete
+from thermostand.stand.running.course import Said
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import Order, attached_optics, check_plan, parse_order
 from thermostand.stand.running.resume import repaired
-from thermostand.stand.running.said import Said
 from thermostand.stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended

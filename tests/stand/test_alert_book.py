@@ -5,7 +5,7 @@ import pytest
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import alert_of
 from thermostand.foundation.items import Event
-from thermostand.stand.serving.alert_book import AlertBook
+from thermostand.stand.serving.alerts import AlertBook
 
 CAUSES = (
     "trip", "hold", "device_lost", "disk", "prompt", "run_started", "run_finished", "run_aborted", "queue_empty",

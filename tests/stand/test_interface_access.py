@@ -23,10 +23,10 @@ from thermostand.stand.serving.api.access import (
     INVITE_PATH,
     STOP_PATH,
     Access,
+    TokenBook,
     is_open,
 )
 from thermostand.stand.serving.api.doors import Interface, OtherDoor
-from thermostand.stand.serving.api.token_book import TokenBook
 from thermostand.stand.serving.client import server_at
 
 TOKEN, LOOKS = "correct-horse-battery-staple", "only-looks-and-stops-for-wall"

@@ -22,9 +22,8 @@ from tests.stand.test_interface_access import LOOKS, PROXIED, TOKEN, ask
 from thermostand.foundation.items import Event
 from thermostand.stand.commands.serve_cli import Reloading
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
-from thermostand.stand.serving.api.access import COOKIE, STOP_PATH
+from thermostand.stand.serving.api.access import COOKIE, STOP_PATH, TokenBook
 from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.api.token_book import TokenBook
 from thermostand.stand.serving.secop.door import door_at
 
 OTHER = "another-token-of-rose-that-is-new"
@@ -191,7 +190,7 @@ import asyncio, os, signal, sys
 os.setsid()
 terminal = os.open(sys.argv[1], os.O_RDWR)  # it is the session's from now on
 from thermostand.stand.commands.serve_cli import Reloading
-from thermostand.stand.serving.api.token_book import TokenBook
+from thermostand.stand.serving.api.access import TokenBook
 
 async def main():
     ended = asyncio.Event()

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from thermostand.foundation.errors import ConfigError
-from thermostand.stand.serving.api.access import is_loopback
+from thermostand.stand.serving.api.access import TokenBook, is_loopback
 from thermostand.stand.serving.api.bridge import Bridge
-from thermostand.stand.serving.api.token_book import TokenBook
 
 
 @dataclass(frozen=True, slots=True)
