@@ -47,7 +47,7 @@ class SessionFacts:
     """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
     segments that a killed recorder left behind and that were not read. utc: from its instants to UTC. spots: what a
     thermal imager saw of the camera, name -> (time_ns, degC). doubtful: frames that the noise model does not describe,
-    so that the covariance of their centres is an estimate (markers.Detection)."""
+    so that the covariance of their centres is an estimate (markers.Detection). uid: of the session alone."""
 
     session_id: str
     recipe: str
@@ -60,6 +60,7 @@ class SessionFacts:
     spots: Mapping[str, tuple[NDArray[np.int64], Float]] = field(
         default_factory=dict[str, tuple[NDArray[np.int64], Float]], compare=False
     )
+    uid: str = ""
     doubtful: int = 0
 
 
@@ -290,6 +291,7 @@ def _facts(session: Session, doubtful: int) -> SessionFacts:
         utc=session.utc,
         spots=_spots(session),
         doubtful=doubtful,
+        uid=session.metadata.get("uid", ""),
     )
 
 
@@ -321,6 +323,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 
     SessionError when camera, target or image size differ: one model is of one camera.
     """
+    parts = _told_apart(parts)
     first = parts[0]
     for index, part in enumerate(parts[1:], 1):
         _check_same(first, part)
@@ -337,6 +340,18 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         histories=tuple(history for part in parts for history in part.histories),
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in (*columns, "flags")},
     )
+
+
+def _told_apart(parts: Sequence[Observations]) -> list[Observations]:
+    """Sessions of one second and recipe have the same id: behind the first one's it says which they are."""
+    known: dict[str, str] = {}
+    told: list[Observations] = []
+    for part in parts:
+        (facts, *others) = part.sessions
+        if known.setdefault(facts.session_id, facts.uid) != facts.uid:
+            facts = replace(facts, session_id=f"{facts.session_id} ({facts.uid})")
+        told.append(replace(part, sessions=(facts, *others)))
+    return told
 
 
 def _check_same(first: Observations, other: Observations) -> None:

@@ -472,7 +472,7 @@ def _info(job: Job, directory: Path, assembly: Assembly) -> SessionInfo:
     """The session's metadata; SessionError when the camera is another one than before the interruption."""
     if job.before is None:
         recipe, config = job.order.recipe.name, job.order.config
-        return info_of(recipe, directory.name, config, camera_serials(assembly), assembly.clock)
+        return info_of(recipe, directory.name, config, camera_serials(assembly), assembly.clock, job.seed)
     if job.before.kept.set_up.camera_on:
         answers, recorded = camera_serials(assembly), job.before.info.camera_serial
         if answers != recorded:

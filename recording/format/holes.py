@@ -56,7 +56,7 @@ class Hole:
         """Which segments, when, and how many frames, as a part of a sentence."""
         frames = "" if not self.frames else f"{self.frames} frame{'' if self.frames == 1 else 's'} {_WHAT[self.series]}"
         if self.first is None:
-            return f"{frames}, {self.when(utc)}"
+            return ", ".join(part for part in (frames, self.when(utc)) if part)
         behind = ", ".join(part for part in (self.when(utc), frames) if part)
         return f"{segments_text(self.series, self.first, self.last)}{f' ({behind})' if behind else ''}"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -23,8 +24,10 @@ class State(StrEnum):
 
 
 _STATE = {FINISHED: State.FINISHED, UNFINISHED: State.UNFINISHED, DAMAGED: State.DAMAGED}
-# A second damaged original of the same number is NNNN.2.mcap.damaged.
-_NAME = re.compile(rf"(\d{{4,}})(?:\.\d+)?({'|'.join(map(re.escape, _STATE))})")
+# A second damaged original of the same number is NNNN.2.mcap.damaged. A number has one spelling.
+_NAME = re.compile(
+    rf"(\d{{4}}|[1-9]\d{{4,}})({re.escape(FINISHED)}|{re.escape(UNFINISHED)}|(?:\.\d+)?{re.escape(DAMAGED)})"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,18 @@ def inventory(directory: Path) -> tuple[SegmentFile, ...]:
     return tuple(file for series in (TELEMETRY, FRAMES) for file in _of_series(directory / series))
 
 
+def strays(directory: Path) -> tuple[str, ...]:
+    """What lies among the segments, is called as if it were one, and is none: a copy (`0003 (1).mcap`, `00003.mcap`),
+    what another system leaves (`._0003.mcap`), or no file. It counts for nothing."""
+    found: list[str] = []
+    for series in (TELEMETRY, FRAMES):
+        with suppress(OSError):
+            names = [path.name for path in (directory / series).iterdir() if path.name.endswith(tuple(_STATE))]
+            known = {file.path.name for file in _of_series(directory / series)}
+            found += [f"{series}/{name}" for name in sorted(set(names) - known)]
+    return tuple(found)
+
+
 def _of_series(folder: Path) -> list[SegmentFile]:
     try:
         paths = list(folder.iterdir())
@@ -63,7 +78,7 @@ def _segment_file(path: Path) -> SegmentFile | None:
     try:
         if name is None or not path.is_file():
             return None
-        state = _STATE[name[2]]
+        state = next(state for suffix, state in _STATE.items() if path.name.endswith(suffix))
         if state is State.UNFINISHED and is_locked(path):
             state = State.RECORDING
         return SegmentFile(path, path.parent.name, int(name[1]), state, path.stat().st_size)

@@ -140,6 +140,9 @@ def glance(path: Path) -> Glance:
     troubles += [*_misfits(seen, metadata), *_kept(files, seen)]
     if journal is not None and journal.damage and extent is None:
         troubles.append(f"{JOURNAL_NAME}: {journal.damage}")
+    if journal is not None and attachments:
+        changed = journal.changed_texts(attachments)
+        troubles += [f"{name} is not attached as the run began with it, by its journal" for name in changed]
     if damage := read_notes(path).damage:
         troubles.append(f"{NOTES_NAME}: {damage}")
     missing = [*_missing(coverage), *(() if extent else _lost_end(coverage, near, journal, utc))]
@@ -183,10 +186,14 @@ def _near(telemetry: Sequence[_Seen]) -> _Near:
 
 
 def _misfits(seen: Sequence[_Seen], metadata: dict[str, str]) -> Iterator[str]:
-    """Segments of another session, or of another place in this one."""
+    """Segments of another session, or of another place in this one, or with other texts."""
+    texts = Counter(tuple(each.head.attachments.items()) for each in seen)
+    most = dict(texts.most_common(1)[0][0]) if texts else {}
     for each in seen:
         if each.head.session != metadata:
             yield f"{each.file.name}: belongs to another session than the other segments"
+        elif each.head.attachments != most:
+            yield f"{each.file.name}: has other texts attached than the other segments"
         if misplaced(each.file.series, each.file.number, each.head.place, each.head.session):
             yield f"{each.file.name}: records another place in the session than its name"
 

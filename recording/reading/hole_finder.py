@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
+from thermostand.foundation.events import RUN_END, TELL_PLAN
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.recording.format.chain import missing_segments
 from thermostand.recording.format.holes import Hole
@@ -22,8 +23,9 @@ from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.format.utc_offsets import offsets_of
 from thermostand.recording.reading.contents import Contents
 from thermostand.recording.reading.ends import Coverage, lost_end
-from thermostand.recording.reading.gaps import lost_frames_of
+from thermostand.recording.reading.gaps import lost_frames_of, reported_blocks
 from thermostand.recording.reading.journal_lines import JournalFacts
+from thermostand.recording.reading.run_word import Run, last_run_event
 
 CAPTURE = "capture"
 
@@ -79,6 +81,21 @@ def _joined(one: Shortage, other: Shortage) -> Shortage:
     return Shortage(steps, missing, one.begin_ns, other.end_ns, one.is_reported)
 
 
+def frames_not_begun(marks: Sequence[StepMark], events: Sequence[Event], metas: Iterable[FrameMeta]) -> int:
+    """How many frames of the plan of a complete run are not there, of whatever step; 0 when an operator has left out
+    one, or the recording does not say that the run is complete."""
+    last = last_run_event(events)
+    planned = [event.data.get("frames") for event in events if event.kind in TELL_PLAN]
+    due = planned[-1] if planned else None
+    is_complete = last is not None and last.kind == RUN_END and last.data.get("status") == Run.COMPLETE
+    if not is_complete or not isinstance(due, int) or any(mark.state is StepState.SKIPPED for mark in marks):
+        return 0
+    most: dict[str, int] = {}
+    for (step_id, _), count in Counter((meta.step_id, meta.channel) for meta in metas).items():
+        most[step_id] = max(most.get(step_id, 0), count)
+    return max(0, due - sum(most.values()) - sum(map(len, reported_blocks(events))))
+
+
 def find_holes(
     coverage: Coverage,
     contents: Contents,
@@ -98,7 +115,11 @@ def find_holes(
         gaps[TELEMETRY] += () if lost is None else (replace(lost.hole, end_ns=None),)
         if all_frames_are_read(coverage) and not any(hole.series == FRAMES for hole in coverage.holes):
             shortages = find_shortages(contents.marks, contents.events, metas)
-    return (*coverage.holes, *gaps[TELEMETRY], *_with_frames(gaps[FRAMES], shortages, coverage))
+    found = (*coverage.holes, *gaps[TELEMETRY], *_with_frames(gaps[FRAMES], shortages, coverage))
+    if not found and not is_part and all_frames_are_read(coverage):
+        missing = frames_not_begun(contents.marks, contents.events, metas)
+        return (Hole(FRAMES, None, None, None, None, missing),) if missing else ()
+    return found
 
 
 def all_frames_are_read(coverage: Coverage) -> bool:

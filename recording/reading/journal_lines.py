@@ -7,11 +7,13 @@ most, is damaged; the lines after it count all the same. What has no end of line
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 from thermostand.foundation.json_values import json_object
 
@@ -88,8 +90,9 @@ class JournalFacts:
     """What a journal says of its run, to be compared with the recording.
 
     last_ns: instant of its last entry. status, ended_ns: how and when the run ended, "" and 0 when the last entry does
-    not say. done: ids of the steps that are done, which were on the disk then. damage: what is wrong with the file,
-    "" when nothing is. unended: what is no line at its end, "" when nothing is.
+    not say. done: ids of the steps that are done, which were on the disk then. damage: what is wrong with the file, ""
+    when nothing is. unended: what is no line at its end, "" when nothing is. texts: name -> hash (`text_hash`) of each
+    text the run began with, None when the journal does not say.
     """
 
     last_ns: int = 0
@@ -99,6 +102,16 @@ class JournalFacts:
     done: frozenset[str] = frozenset()
     damage: str = ""
     unended: str = ""
+    texts: Mapping[str, str] | None = None
+
+    def changed_texts(self, attached: Mapping[str, str]) -> list[str]:
+        """The names of the texts that are not attached as the run began with them, or not at all."""
+        return [name for name, known in (self.texts or {}).items() if text_hash(attached.get(name)) != known]
+
+
+def text_hash(text: str | None) -> str:
+    """Of an attached text; "" for none."""
+    return "" if text is None else hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def journal_facts(directory: Path) -> JournalFacts | None:
@@ -128,7 +141,16 @@ def journal_facts(directory: Path) -> JournalFacts | None:
         frozenset(step_id for step_id in done if isinstance(step_id, str)),
         damage_text(lines) if lines.damaged else "",
         unended_text(lines.unended_bytes) if lines.unended_bytes else "",
+        _texts(json_object(lines.sound[0]) if lines.sound else None),
     )
+
+
+def _texts(first: Mapping[str, object] | None) -> dict[str, str] | None:
+    """Those of a journal's first entry."""
+    found = None if first is None or first.get("entry") != "Begun" else first.get("texts")
+    if not isinstance(found, dict):
+        return None
+    return {str(name): str(known) for name, known in cast("dict[object, object]", found).items()}
 
 
 def _instant(value: object) -> int:

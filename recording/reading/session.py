@@ -38,12 +38,10 @@ from thermostand.recording.format.decoded_items import (
 from thermostand.recording.format.holes import Hole, holes_in
 from thermostand.recording.format.inventory import State, inventory
 from thermostand.recording.format.layout import (
-    DAMAGED,
     DEVICES,
     FINISHED,
     FRAMES,
     TELEMETRY,
-    UNFINISHED,
     unknown_format,
 )
 from thermostand.recording.format.records import (
@@ -64,9 +62,9 @@ from thermostand.recording.reading.frames_table import FramesTable, frames_table
 from thermostand.recording.reading.hole_finder import find_holes
 from thermostand.recording.reading.journal_lines import journal_facts
 from thermostand.recording.reading.run_word import Run, run_word
-from thermostand.recording.reading.segment_files import number_of, segments_in, segments_of
 
 T = TypeVar("T")
+_UNFINISHED = (State.UNFINISHED, State.RECORDING)
 _TOPICS_OF_HOLES = (messages.EVENT, messages.STEP)
 
 
@@ -79,8 +77,9 @@ class Session:
 
     def __init__(self, path: Path, telemetry: list[Path], frames: list[Path]) -> None:
         self.path = path
-        self.incomplete = segments_of(path, UNFINISHED)
-        self.damaged = segments_of(path, DAMAGED)
+        files = inventory(path)
+        self.incomplete = tuple(file.path for file in files if file.state in _UNFINISHED)
+        self.damaged = tuple(file.path for file in files if file.state is State.DAMAGED)
         self._telemetry = telemetry
         self._frames = frames
         head = read_head(telemetry[0])
@@ -102,11 +101,13 @@ class Session:
     def open(cls, path: Path | str) -> Session:
         """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
         path = Path(path)
-        telemetry, frames = (segments_in(path / name, FINISHED) for name in (TELEMETRY, FRAMES))
+        files = inventory(path)
+        finished = [file for file in files if file.state is State.FINISHED]
+        telemetry, frames = ([file.path for file in finished if file.series == name] for name in (TELEMETRY, FRAMES))
         if not telemetry and not path.is_dir():
             raise NotThere(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
         if not telemetry:
-            count = len(segments_of(path, UNFINISHED))
+            count = sum(file.state in _UNFINISHED for file in files)
             unfinished = f", only {count} unfinished ones" if count else ""
             kind = SessionError if count else NotThere
             raise kind(f"{path}: not a session: there is no finished segment in {path / TELEMETRY}{unfinished}")
@@ -332,7 +333,7 @@ class Session:
         span = message_span(segment)
         return Link(
             segment.parent.name,
-            number_of(segment),
+            _number_of(segment),
             span.count,
             span.first_ns,
             span.last_ns,
@@ -363,10 +364,18 @@ class Session:
             raise _Unreadable(str(error)) from error
         if head.session != self.metadata:
             raise SessionError(f"{segment}: belongs to another session than {self._telemetry[0]}; move it away")
-        if head.place and misplaced(segment.parent.name, number_of(segment), head.place, head.session):
+        if head.attachments != self._attachments:
+            raise SessionError(
+                f"{segment}: has other texts attached than {self._telemetry[0]}; one of them was changed"
+            )
+        if head.place and misplaced(segment.parent.name, _number_of(segment), head.place, head.session):
             where = f"{head.place.get('series')}/{head.place.get('number')}{FINISHED}"
             raise SessionError(f"{segment}: was recorded as {where}; give it that name again, or move it away")
         self._salvaged[segment] = bool(head.salvaged)
+
+
+def _number_of(segment: Path) -> int:
+    return int(segment.name.partition(".")[0])
 
 
 class _Unreadable(FileDamaged):

@@ -8,6 +8,7 @@ from pathlib import Path
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.inventory import State, inventory
 from thermostand.recording.reading.ends import frames_of_plan
+from thermostand.recording.reading.journal_lines import journal_facts
 from thermostand.recording.reading.run_word import Run
 from thermostand.recording.reading.session import Session
 
@@ -27,6 +28,12 @@ def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
 def check_whole(session: Session, incomplete: Say | None = None) -> None:
     """As above, for a session that is open."""
     _check_finished(session.path, incomplete)
+    journal = journal_facts(session.path)
+    if journal is not None and (changed := journal.changed_texts(session.attachments)):
+        raise SessionError(
+            f"{session.path}: {changed[0]} is not attached as the run began with it, by its journal; "
+            "take the session from its archive"
+        )
     missing = [hole for hole in session.holes if not hole.excused]
     if not missing:
         return

@@ -11,7 +11,6 @@ segment's vote before the own and the own before an unfinished one's when they a
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -20,10 +19,12 @@ from pathlib import Path
 
 from mcap.records import Attachment, Channel, Schema
 
+from thermostand.recording.format.inventory import State, inventory
 from thermostand.recording.format.layout import FINISHED, FRAMES, TELEMETRY
 from thermostand.recording.format.mcap_bytes import Source
 from thermostand.recording.reading.walk import Survey, survey
 
+_GREATEST = 999_999_999  # a number beyond is none that a recorder has given
 SIBLINGS_PER_SERIES = 4  # enough for a vote, few enough for a night of hundreds
 SESSION_ID = "session_id"
 
@@ -66,10 +67,8 @@ def opening_of(path: Path, own: Survey) -> Opening | None:
 
 def segments_of(series: Path) -> list[Path]:
     """The finished and unfinished segments in a folder; none when there is no such folder."""
-    with suppress(OSError):
-        named = [path for path in series.iterdir() if re.fullmatch(r"\d{4,9}\.mcap(\.part)?", path.name)]
-        return [path for path in named if path.is_file()]
-    return []
+    files = (file for file in inventory(series.parent) if file.series == series.name)
+    return [file.path for file in files if file.state is not State.DAMAGED and file.number <= _GREATEST]
 
 
 def _siblings(path: Path) -> Iterator[_Sibling]:
@@ -95,9 +94,13 @@ def _read_opening(path: Path) -> Survey:
         os.close(fd)
 
 
+def _identity(session: Mapping[str, str]) -> tuple[str, str]:
+    return session.get(SESSION_ID, ""), session.get("uid", "")
+
+
 def _agree(one: Survey, other: Survey) -> bool:
     """Whether nothing that is known of both says that they are of different sessions."""
-    if one.session and other.session and one.session.get(SESSION_ID) != other.session.get(SESSION_ID):
+    if one.session and other.session and _identity(one.session) != _identity(other.session):
         return False
     both = one.attachments.keys() & other.attachments.keys()
     return all(one.attachments[name].data == other.attachments[name].data for name in both)
@@ -108,7 +111,7 @@ def _session(own: Survey, siblings: list[_Sibling]) -> Mapping[str, str] | None:
     finished = [sibling.found.session for sibling in siblings if sibling.path.name.endswith(FINISHED)]
     unfinished = [sibling.found.session for sibling in siblings if not sibling.path.name.endswith(FINISHED)]
     votes = [session for session in (*finished, own.session, *unfinished) if session]
-    if len({session.get(SESSION_ID) for session in votes}) != 1:
+    if len({_identity(session) for session in votes}) != 1:
         return None
     ((winner, _),) = Counter(tuple(session.items()) for session in votes).most_common(1)
     return dict(winner)

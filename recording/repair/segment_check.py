@@ -67,12 +67,13 @@ class Damage(NamedTuple):
 
 @dataclass
 class SegmentCheck:
-    """What the walk through a segment found. descriptions: of its sound frames, as messages. `last_ns`: log time of its
-    latest sound message."""
+    """What the walk through a segment found. texts: what is attached. descriptions: of its sound frames, as messages.
+    `last_ns`: log time of its latest sound message."""
 
     path: Path
     damages: list[Damage] = field(default_factory=list[Damage])
     metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    texts: dict[str, str] = field(default_factory=dict[str, str])
     descriptions: list[bytes] = field(default_factory=list[bytes])
     messages: int = 0
     first_ns: float = inf
@@ -201,6 +202,8 @@ class _Walk:
             _check_same(bytes_of(attachment), data, "an attachment")
             if attachment.name == FRAME_TABLE:
                 self._table = attachment.data
+            else:
+                self._check.texts[attachment.name] = attachment.data.decode(errors="surrogateescape")
         else:
             metadata = Metadata.read(stream(content))
             _check_same(bytes_of(metadata), data, "a metadata record")

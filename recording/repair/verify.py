@@ -18,7 +18,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import FRAMES_DROPPED
 from thermostand.recording.format.chain import MOST_MISSING, Link, foreign_numbers, misplaced, missing_segments
 from thermostand.recording.format.holes import Hole, holes_in, segments_text
-from thermostand.recording.format.inventory import SegmentFile, State, inventory
+from thermostand.recording.format.inventory import SegmentFile, State, inventory, strays
 from thermostand.recording.format.layout import (
     FINISHED,
     FRAMES,
@@ -35,7 +35,7 @@ from thermostand.recording.reading.contents import Contents
 from thermostand.recording.reading.ends import Coverage, is_of_a_run, lost_end
 from thermostand.recording.reading.extent import Extent, extent_of
 from thermostand.recording.reading.gaps import silences
-from thermostand.recording.reading.hole_finder import all_frames_are_read, find_shortages
+from thermostand.recording.reading.hole_finder import all_frames_are_read, find_shortages, frames_not_begun
 from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
 from thermostand.recording.reading.kept_originals import is_recovered
 from thermostand.recording.reading.notes import NOTES_NAME, Notes, read_notes
@@ -157,9 +157,11 @@ def verify(path: Path, report: Callable[[float, str], None] = no_report) -> Veri
         *_format(read.session()),
         *_extent(extent, utc),
         *_not_finished(files, read.checks),
+        *(_note("is no segment by its name, or no file; it counts for nothing", name) for name in strays(path)),
         *_missing(coverage, utc),
         *_damaged(read),
         *_metadata(finished, read),
+        *_texts(finished, read, journal),
         *(() if extent else _journal_and_end(read, coverage, journal, utc)),
         *_notes(read_notes(path)),
         *(() if extent else _steps_without_frames(read, coverage)),
@@ -310,6 +312,19 @@ def _metadata(finished: list[SegmentFile], read: _Read) -> Iterator[Finding]:
             yield _note(f"was salvaged ({', '.join(f'{key}: {text}' for key, text in salvage.items())})", file.name)
 
 
+def _texts(finished: list[SegmentFile], read: _Read, journal: JournalFacts | None) -> Iterator[Finding]:
+    """Every segment has the same texts attached, and they are those that the run began with."""
+    attached = {file.name: read.checks[file.name].texts for file in finished if not read.checks[file.name].damages}
+    stated = Counter(tuple(sorted(texts.items())) for texts in attached.values())
+    most = dict(stated.most_common(1)[0][0]) if stated else {}
+    for name, texts in attached.items():
+        if texts != most:
+            yield _error("has other texts attached than the other segments", name)
+    if journal is not None and attached:
+        for name in journal.changed_texts(most):
+            yield _error(f"{name} is not attached as the run began with it, by its journal")
+
+
 def _entries(metadata: dict[str, str] | None) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((metadata or {}).items()))
 
@@ -319,7 +334,13 @@ def _steps_without_frames(read: _Read, coverage: Coverage) -> Iterator[Finding]:
     if not all_frames_are_read(coverage) or any(hole.series == FRAMES for hole in coverage.holes):
         return
     contents, utc = read.contents, offsets_of(read.contents.events)
-    for short in find_shortages(contents.marks, contents.events, read.metas):
+    shortages = find_shortages(contents.marks, contents.events, read.metas)
+    is_whole = not any(check.damages for check in read.checks.values())
+    is_whole &= not any(any(missing_segments(name, _numbers(coverage, name), ())) for name in (TELEMETRY, FRAMES))
+    if is_whole and not shortages and (missing := frames_not_begun(contents.marks, contents.events, read.metas)):
+        frames = "1 frame" if missing == 1 else f"{missing} frames"
+        yield _missing_part(f"{frames} of the plan: missing, though the run is complete")
+    for short in shortages:
         frames = "1 frame" if short.missing == 1 else f"{short.missing} frames"
         steps = short.step_ids[0] if len(short.step_ids) == 1 else f"{short.step_ids[0]} to {short.step_ids[-1]}"
         which = f"{frames} of {steps}, {utc.date_time(short.begin_ns)} to {utc.local_text(short.end_ns)}"
@@ -327,6 +348,10 @@ def _steps_without_frames(read: _Read, coverage: Coverage) -> Iterator[Finding]:
             yield _note(f"{which}: lost by the recorder, as its events say")
         elif not read.is_damaged(FRAMES):
             yield _missing_part(f"{which}: missing, though their steps are done")
+
+
+def _numbers(coverage: Coverage, series: str) -> set[int]:
+    return {file.number for file in coverage.files if file.series == series}
 
 
 def _frames_lost(read: _Read) -> Iterator[Finding]:

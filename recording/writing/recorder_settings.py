@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 from thermostand.recording.format.images import FrameEncoding
 from thermostand.recording.format.layout import FORMAT
 
-_NOT_EMPTY = ("extent", "holes")  # left out of the record when they are
+_NOT_EMPTY = ("uid", "extent", "holes")  # left out of the record when they are
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,9 @@ class SessionInfo:
     another machine is the same session.
 
     format: of the files. extent: of a part that was cut out of a session, the range and how the run
-    ended, as JSON; holes: of a copy of a session that is not whole, what the original lacked (holes.py).
+    ended, as JSON; holes: of a copy of a session that is not whole, what the original lacked (holes.py). uid:
+    of this session alone, in hex digits, also when another one of its second and recipe has the same `session_id`; on a
+    virtual clock it follows from the seed.
     """
 
     session_id: str
@@ -34,6 +36,7 @@ class SessionInfo:
     format: str = str(FORMAT)
     extent: str = ""
     holes: str = ""
+    uid: str = ""
 
     def metadata(self) -> dict[str, str]:
         """The fields as MCAP metadata."""

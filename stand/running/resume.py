@@ -22,6 +22,7 @@ from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.progress import late_progress
 from thermostand.recording.format.restarts import frames_lost_of, restarted_step
 from thermostand.recording.reading.glance import glance
+from thermostand.recording.reading.journal_lines import text_hash
 from thermostand.recording.reading.run_word import Run, last_run_event
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
@@ -58,7 +59,7 @@ def plan_hash(plan: Iterable[PlannedStep]) -> str:
 
 
 def _text_hashes(texts: Mapping[str, str]) -> dict[str, str]:
-    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in texts.items()}
+    return {name: text_hash(text) for name, text in texts.items()}
 
 
 @dataclass(frozen=True, slots=True)

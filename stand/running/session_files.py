@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import itertools
 import os
 import platform
+import secrets
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
@@ -38,17 +40,21 @@ def session_directory(out: Path, order: Order, clock: Clock) -> Path:
     return next(directory for directory in map(out.joinpath, names) if not os.path.lexists(directory))
 
 
-def info_of(recipe: str, session: str, config: StandConfig, camera_serial: str, clock: Clock) -> SessionInfo:
-    """Who records what with which."""
+def info_of(
+    recipe: str, session: str, config: StandConfig, camera_serial: str, clock: Clock, seed: int | None = None
+) -> SessionInfo:
+    """Who records what with which; `seed`: of a run in virtual time."""
+    is_virtual = isinstance(clock, VirtualClock)
     return SessionInfo(
         session_id=session,
         recipe=recipe,
         operator=config.operator,
         camera_serial=camera_serial,
         software_version=importlib.metadata.version("thermostand"),
-        clock_source="virtual" if isinstance(clock, VirtualClock) else "wall",
+        clock_source="virtual" if is_virtual else "wall",
         simulated=config.simulation is not None,
         host=platform.node(),
+        uid=hashlib.sha256(f"{seed} {session}".encode()).hexdigest()[:16] if is_virtual else secrets.token_hex(8),
     )
 
 

@@ -194,10 +194,6 @@ def foreign_mcap(directory):
         writer.finish()
 
 
-def folder_in_place_of_a_file(directory):
-    (directory / TELEMETRY / "0002.mcap").mkdir()
-
-
 def segment_of_another_session(directory):
     write_frames(directory, [9], {"session_id": "night-2"})
 
@@ -212,7 +208,6 @@ def segment_of_another_session(directory):
         (magic_only, "ends in the middle"),
         (cut_short, "ends in the middle"),
         (foreign_mcap, "not a segment of a thermostand session"),
-        (folder_in_place_of_a_file, "is no file; no session has a folder"),
         (segment_of_another_session, "belongs to another session"),
     ],
 )
