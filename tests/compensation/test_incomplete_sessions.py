@@ -36,7 +36,7 @@ def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path
     status, said = ask("detect", holed, "-o", out)
     assert status == 1
     assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in said
-    assert "frames of steps that are done); use --incomplete to read the rest" in said
+    assert said.endswith("; use --incomplete to read the rest")
     assert not out.exists()
     status, said = ask("detect", holed, "-o", out, "--incomplete")
     assert status == 0
