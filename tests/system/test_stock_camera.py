@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.stock_camera import ADDRESS, SERIAL
-from thermostand.drivers.devices.cameras.cameras_by_protocol import make_camera
+from thermostand.drivers.devices.cameras.cameras_by_protocol import PROTOCOLS
 from thermostand.foundation.clock import WallClock
 from thermostand.stand.config.stand_config import load_config
 
@@ -16,7 +16,7 @@ async def test_a_configuration_file_is_all_the_stock_camera_needs(tmp_path: Path
     file = tmp_path / "stock.yaml"
     section = {"address": ADDRESS, "serial_number": SERIAL, "width_px": 320, "height_px": 240, "packet_size": None}
     file.write_text(config_text(camera=section))
-    camera = make_camera("camera", load_config(file).cameras["camera"], WallClock())
+    camera = PROTOCOLS["gige"].Camera("camera", load_config(file).cameras["camera"], WallClock())
     await camera.open()
     try:
         frames = [await camera.grab(0.01) for _ in range(3)]
