@@ -4,35 +4,38 @@ journal. Damage and unfinished segments are part of the answer, not a reason to 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
+
+from mcap.records import DataEnd, Message
+from mcap.stream_reader import StreamReader
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event, StepMark
 from thermostand.recording.format import messages
 from thermostand.recording.format.chain import Link, misplaced, missing_segments
-from thermostand.recording.format.damage import reading
+from thermostand.recording.format.damage import DAMAGE, reading
 from thermostand.recording.format.decoded_items import event_of, step_of
 from thermostand.recording.format.holes import holes_in, segments_text
 from thermostand.recording.format.inventory import SegmentFile, State, inventory
 from thermostand.recording.format.layout import FINISHED, FRAMES, TELEMETRY, unknown_format
 from thermostand.recording.format.mcap_bytes import Source
-from thermostand.recording.format.records import Head, read_head, telemetry_messages
+from thermostand.recording.format.messages import FrameMeta
+from thermostand.recording.format.records import Head, frame_places, read_head, telemetry_messages
 from thermostand.recording.format.summary import Summary, read_summary
 from thermostand.recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
 from thermostand.recording.reading.ends import Coverage, frames_of_plan, is_of_a_run, lost_end
 from thermostand.recording.reading.extent import extent_of
 from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
-from thermostand.recording.reading.kept_originals import is_recovered
 from thermostand.recording.reading.notes import NOTES_NAME, read_notes
 from thermostand.recording.reading.run_word import Files, Run, run_word
 from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.temperature_present import NO_TEMPERATURE, has_recorded_temperature
 from thermostand.recording.reading.walk import survey
 
 _NEAR = (messages.EVENT, messages.STEP)
@@ -271,3 +274,50 @@ def _opening(files: Sequence[SegmentFile], seen: Sequence[_Seen]) -> tuple[dict[
                 name: entry.data.decode(errors="replace") for name, entry in found.attachments.items()
             }
     return {}, {}
+
+
+# The originals of damaged segments that a salvage has kept, compared with what it recovered of them.
+
+
+def is_recovered(kept: SegmentFile, salvage: Mapping[str, str], recovered: int) -> bool:
+    """Whether the salvaged segment (its record `salvage`, its number of messages) has every message of the original:
+    its salvage lost no byte, and both have as many. The original must reach the end of its data; of one that was cut
+    short the number of messages is unknown."""
+    if salvage.get("lost_bytes") != "0":
+        return False
+    messages = 0
+    try:
+        with kept.path.open("rb") as file:
+            for record in StreamReader(file, validate_crcs=True, record_size_limit=kept.size_bytes).records:
+                if isinstance(record, DataEnd):
+                    return messages == recovered
+                messages += isinstance(record, Message)
+    except DAMAGE:
+        pass
+    return False
+
+
+# Whether any frame has the camera's own temperature, without which no drift over it can be fitted.
+
+NO_TEMPERATURE = "no frame has a good camera temperature"
+
+
+def has_temperature(metas: Iterable[FrameMeta]) -> bool | None:
+    """By the descriptions of the frames, as far as the first that has one; None without any description."""
+    found = None
+    for meta in metas:
+        if not math.isnan(meta.camera_degC):
+            return True
+        found = False
+    return found
+
+
+def has_recorded_temperature(segments: Iterable[Path]) -> bool | None:
+    """By these segments of the frames, as far as they can be read."""
+
+    def metas() -> Iterable[FrameMeta]:
+        for path in segments:
+            with suppress(SessionError):
+                yield from (place.meta for place in frame_places(path))
+
+    return has_temperature(metas())

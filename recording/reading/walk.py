@@ -1,9 +1,9 @@
 """A segment's bytes, also damaged ones: which records are proven sound, and where none are.
 
 Read by place from the front; what counts as a proof is in recording/format/proof.py, what as a block that was being
-written in recording/reading/torn.py. Behind a damaged place the walk continues at the next bytes that look like a
+written in Blocks. Behind a damaged place the walk continues at the next bytes that look like a
 record and prove to be one. Inside sound records nothing is searched, so an MCAP file that is attached is an attachment.
-Chunks that a disk has put into the wrong place count as damage (recording/reading/misplaced.py).
+Chunks that a disk has put into the wrong place count as damage (find_misplaced_chunks).
 
 Memory is flat: one record at a time. Only OSError is raised, when the disk does not give a byte.
 """
@@ -13,19 +13,30 @@ from __future__ import annotations
 import errno
 import os
 import re
+import zlib
+from array import array
+from bisect import bisect
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from itertools import accumulate, pairwise
+from math import inf
 from typing import NamedTuple
 
+import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from thermostand.foundation.clock import NS_PER_S
 from thermostand.recording.format.damage import DAMAGE
 from thermostand.recording.format.layout import FRAME_TABLE, SEGMENT_METADATA, SESSION_METADATA, contradicts
 from thermostand.recording.format.mcap_bytes import (
+    CRC,
     MESSAGE,
+    MESSAGE_INDEX,
+    MESSAGE_INDEX_ENTRY,
     RECORD,
     ChunkHead,
     Source,
@@ -34,11 +45,267 @@ from thermostand.recording.format.mcap_bytes import (
     records,
     stream,
 )
-from thermostand.recording.format.proof import Contents, claim_of, proven
+from thermostand.recording.format.proof import OPCODES, Claim, Contents, claim_of, proven
 from thermostand.recording.format.summary import read_summary
-from thermostand.recording.reading.doubt import Doubt
-from thermostand.recording.reading.misplaced import PlacedChunk, Span, find_misplaced_chunks
-from thermostand.recording.reading.torn import Blocks
+
+# The CRC-32 of any stretch of a file, without reading the stretch each time.
+#
+# CRC-32 is a remainder of polynomials, so that of a stretch follows from those of the file up to its begin and up to
+# its end: crc(AB) = crc(A) x^(8 |B|) + crc(B) modulo the generator (zlib's crc32_combine). Those up to every 4 KiB are
+# kept; the file is read once, however many stretches are asked for.
+
+_STEP_BYTES = 1 << 12
+_READ_BYTES = 1 << 20
+_GENERATOR = 0xEDB88320  # of CRC-32, the lowest bit is the highest power
+_ONE = 1 << 31
+
+
+class RangeCrcs:
+    """Of the stretches of `source` behind `begin`. Raises OSError when the disk does not give a byte."""
+
+    def __init__(self, source: Source, begin: int) -> None:
+        self._source = source
+        self._begin = begin
+        self._crcs = array("I", [0])  # of the bytes from `begin` on, up to each step
+
+    def of(self, begin: int, end: int) -> int:
+        """The CRC-32 of the bytes [begin, end) of the file."""
+        return self._up_to(end) ^ _times(_power_of_bytes(end - begin), self._up_to(begin))
+
+    def _up_to(self, place: int) -> int:
+        step, rest_bytes = divmod(place - self._begin, _STEP_BYTES)
+        while len(self._crcs) <= step:
+            self._read_on()
+        return zlib.crc32(self._source.read(place - rest_bytes, rest_bytes), self._crcs[step])
+
+    def _read_on(self) -> None:
+        place = self._begin + (len(self._crcs) - 1) * _STEP_BYTES
+        data = memoryview(self._source.read(place, _READ_BYTES))
+        for step in range(0, max(1, len(data)), _STEP_BYTES):
+            self._crcs.append(zlib.crc32(data[step : step + _STEP_BYTES], self._crcs[-1]))
+
+
+def _power_of_bytes(count: int) -> int:
+    """x to the power of 8 `count`, modulo the generator."""
+    power, place = _ONE, 0
+    while count:
+        power = _times(_power(place, count & 0xFF), power)
+        count, place = count >> 8, place + 1
+    return power
+
+
+@cache
+def _power(place: int, digit: int) -> int:
+    """x to the power of 8 `digit` 256**place."""
+    power = _ONE >> 8 if place == 0 else _power(place - 1, 128)  # of one
+    power = power if place == 0 else _times(power, power)
+    product = _ONE
+    while digit:
+        if digit & 1:
+            product = _times(power, product)
+        power, digit = _times(power, power), digit >> 1
+    return product
+
+
+def _times(one: int, other: int) -> int:
+    """The product of two polynomials, modulo the generator."""
+    product = 0
+    while one:
+        if one & _ONE:
+            product ^= other
+        one = one << 1 & 0xFFFFFFFF
+        other = other >> 1 ^ _GENERATOR if other & 1 else other >> 1
+    return product
+
+
+# How far the heads of records in damaged bytes are believed, so that a salvage takes time in proportion to the file.
+#
+# To find out whether a record proves itself all of it is read. Somebody can write a file full of heads of which each
+# claims all the rest. So when false claims have cost more than the file's size, the CRC that a head gives is compared
+# with that of its stretch first (RangeCrcs), which reads nothing twice, and of what is compressed only
+# the begin is inflated. When even so false claims have cost many times the size, nothing more is believed: the damaged
+# place goes to the end of the file, and the salvage keeps the original.
+
+_FREE_BYTES = 1 << 24  # more than what any damage of a disk makes false in a small file
+_LIMIT_BYTES, _LIMIT_FACTOR = 1 << 28, 16
+_SMALL_BYTES = 1 << 13  # of a record that are read in any case, where no CRC can be compared
+
+
+class Doubt:
+    """About the claims in one file."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._false_bytes = 0
+        self._crcs: RangeCrcs | None = None
+
+    def note_false(self, size_bytes: int) -> None:
+        """So many bytes were read, or inflated, for a claim that was false."""
+        self._false_bytes += size_bytes
+
+    def can_be_true(self, offset: int, claim: Claim, chunk: ChunkHead | None) -> bool:
+        """Whether the record at `offset` is worth being read; `chunk` is its head when it is one."""
+        if self._false_bytes <= self._source.size + _FREE_BYTES:
+            return True
+        if self._false_bytes > _LIMIT_FACTOR * self._source.size + _LIMIT_BYTES:
+            return False
+        begin, end = offset + RECORD.size, offset + RECORD.size + claim.length
+        if chunk is not None and chunk.compression:
+            return _begins_well(self._source.read(begin + chunk.begin, min(_SMALL_BYTES, end - begin - chunk.begin)))
+        if chunk is not None:
+            return self._crc(begin + chunk.begin, end) == chunk.crc
+        if claim.opcode == Opcode.ATTACHMENT and claim.length >= CRC.size:
+            crc = self._source.read(end - CRC.size, CRC.size)
+            return CRC.pack(self._crc(begin, end - CRC.size)) == crc
+        return claim.length <= _SMALL_BYTES
+
+    def _crc(self, begin: int, end: int) -> int:
+        if self._crcs is None:
+            self._crcs = RangeCrcs(self._source, begin)
+        return self._crcs.of(begin, end)
+
+
+def _begins_well(data: bytes) -> bool:
+    """Whether that can be the begin of a compressed chunk."""
+    try:
+        zstandard.ZstdDecompressor().decompressobj().decompress(data)
+    except zstandard.ZstdError:
+        return False
+    return True
+
+
+# Sound chunks that are not of their place: a disk has written a sector to the wrong one, with whole chunks in it.
+#
+# Such a sector begins and ends somewhere in other chunks, so it stands between two damages. What it holds stands in the
+# file once more, or is of another session, and so of another time than what is around it.
+
+SECTOR_BYTES = 4096  # the largest of today's disks
+APART_NS = 10 * NS_PER_S
+"""Chunks are in the order in which they were published, but for what was seconds late. Sessions that lie closer
+together than this, as those in virtual time may, are not told apart."""
+
+
+class Span(NamedTuple):
+    """Bytes [begin, end) of a file."""
+
+    begin: int
+    end: int
+
+
+class PlacedChunk(NamedTuple):
+    """A sound chunk, where it begins, and how many messages of each channel it has."""
+
+    begin: int
+    head: ChunkHead
+    messages: Counter[int]
+
+
+def find_misplaced_chunks(chunks: Sequence[PlacedChunk], damages: Sequence[Span]) -> list[Span]:
+    """Where such sectors are: from the begin of the damage before to the end of the one behind."""
+    near = [pair for pair in pairwise(damages) if pair[1].begin - pair[0].end <= SECTOR_BYTES]
+    if not near:
+        return []
+    ends = [before.end for before, _ in near]
+    inside: list[list[PlacedChunk]] = [[] for _ in near]
+    trusted: list[PlacedChunk] = []
+    for chunk in chunks:
+        index = bisect(ends, chunk.begin) - 1
+        is_between = index >= 0 and chunk.begin < near[index][1].begin
+        (inside[index] if is_between else trusted).append(chunk)
+    begins = [chunk.begin for chunk in trusted]
+    since_ns = [-inf, *accumulate((chunk.head.first_ns for chunk in trusted), max)]
+    until_ns = [inf, *accumulate((chunk.head.last_ns for chunk in reversed(trusted)), min)][::-1]
+    copies = Counter(chunk.head for chunk in chunks)
+
+    def is_misplaced(chunk: PlacedChunk) -> bool:
+        place, head = bisect(begins, chunk.begin), chunk.head
+        is_late, is_early = head.first_ns > until_ns[place] + APART_NS, head.last_ns < since_ns[place] - APART_NS
+        return copies[head] > 1 or is_late or is_early
+
+    return [
+        Span(before.begin, after.end)
+        for (before, after), found in zip(near, inside, strict=True)
+        if any(map(is_misplaced, found))
+    ]
+
+
+# Whether the damaged end of a file is the one block that was being written when the power went, or more than that.
+#
+# A block is what is written at once and acknowledged when it is on the disk: the opening of a segment, or a chunk and
+# the message indexes behind it. What an interrupted write leaves is the beginning of a block, then zeros or nothing. A
+# whole block was acknowledged, so damage that is longer than a block is a loss. Of a block of which nothing was written
+# the length is not known: it may be a quarter longer than any before.
+
+FIRST_BLOCK_BYTES = 1 << 14  # more than an opening, or a second's telemetry with its schemas, usually is
+
+
+class Blocks:
+    """How long the blocks of a segment are, as far as it has been read."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._end = 0  # of the last one
+        self._largest_bytes = FIRST_BLOCK_BYTES
+        self._largest_index_bytes = _index_bytes(Counter((0,)))
+
+    def note(self, begin: int, chunk_end: int, messages: Counter[int]) -> None:
+        """The block of the sound chunk [begin, chunk_end), with so many messages of each channel."""
+        self._count += 1
+        index_bytes = _index_bytes(messages)
+        self._end = chunk_end + index_bytes
+        known_bytes = self._largest_bytes if self._count > 2 else 0  # the first is longer, for it holds the schemas
+        self._largest_bytes = max(known_bytes, self._end - begin)
+        self._largest_index_bytes = max(self._largest_index_bytes, index_bytes)
+
+    def is_torn(self, source: Source, begin: int) -> bool:
+        """Whether the bytes from `begin` to the end of the file, which prove nothing, were never acknowledged."""
+        written_end = _last_written(source, begin)
+        head = source.read(begin, RECORD.size)
+        return _is_begun(head, begin, written_end) and source.size <= self._latest_end(head, begin, written_end)
+
+    def _latest_end(self, head: bytes, begin: int, written_end: int) -> int:
+        """Where the block with the damage at `begin` ends at the latest."""
+        if begin < self._end:  # in the message indexes of the last one
+            return self._end
+        claim = claim_of(head)
+        claimed_bytes = 0 if claim is None else self._claimed_bytes(claim)
+        if written_end < begin + RECORD.size:  # the zeros may be the length's own
+            return begin + max(claimed_bytes, self._largest_bytes * 5 // 4)  # frames are of almost one size
+        return begin + claimed_bytes
+
+    def _claimed_bytes(self, claim: Claim) -> int:
+        """The size of the block that begins with that record."""
+        rest_bytes = self._largest_index_bytes if claim.opcode == Opcode.CHUNK else FIRST_BLOCK_BYTES
+        return RECORD.size + claim.length + rest_bytes
+
+
+def _is_begun(head: bytes, begin: int, written_end: int) -> bool:
+    """Whether a record begins there and is cut where the zeros begin."""
+    written = head[: written_end - begin]
+    if begin == 0:
+        return MCAP0_MAGIC.startswith(written)
+    if len(written) < RECORD.size:
+        return not written or written[0] in OPCODES
+    claim = claim_of(head)
+    return claim is not None and written_end < begin + RECORD.size + claim.length
+
+
+def _index_bytes(messages: Counter[int]) -> int:
+    """The size of the message indexes behind a chunk."""
+    head_bytes = RECORD.size + MESSAGE_INDEX.size
+    return sum(head_bytes + MESSAGE_INDEX_ENTRY.size * count for count in messages.values())
+
+
+def _last_written(source: Source, begin: int) -> int:
+    """Where the zeros begin that fill the end of the file."""
+    end = source.size
+    while end > begin:
+        window = max(begin, end - WINDOW_BYTES)
+        if source.next_data(window) < end and (data := source.read(window, end - window).rstrip(b"\0")):
+            return window + len(data)
+        end = window
+    return begin
+
 
 WINDOW_BYTES = 4 << 20
 

@@ -35,14 +35,13 @@ from thermostand.recording.reading.contents import Contents
 from thermostand.recording.reading.ends import Coverage, is_of_a_run, lost_end
 from thermostand.recording.reading.extent import Extent, extent_of
 from thermostand.recording.reading.gaps import silences
+from thermostand.recording.reading.glance import NO_TEMPERATURE, has_temperature, is_recovered
 from thermostand.recording.reading.hole_finder import all_frames_are_read, find_shortages, frames_not_begun
 from thermostand.recording.reading.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts
-from thermostand.recording.reading.kept_originals import is_recovered
 from thermostand.recording.reading.notes import NOTES_NAME, Notes, read_notes
 from thermostand.recording.reading.run_word import Files, Run, run_word
-from thermostand.recording.reading.temperature_present import NO_TEMPERATURE, has_temperature
+from thermostand.recording.repair.salvage import no_report
 from thermostand.recording.repair.segment_check import Damage, SegmentCheck, check_segment
-from thermostand.recording.repair.share_done import no_report
 from thermostand.recording.writing.recorder_settings import SessionInfo
 
 

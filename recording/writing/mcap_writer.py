@@ -68,6 +68,7 @@ class McapWriter:
         self._chunk_bytes = chunk_bytes
         self._parts: list[bytes | memoryview] = []
         self._written_bytes = 0
+        self._is_ended = False
         self._chunk = _Chunk()
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
@@ -163,10 +164,16 @@ class McapWriter:
             )
         )
 
+    def end_data(self) -> None:
+        """The end of the data, behind which is the index: nothing is added any more."""
+        if not self._is_ended:
+            self._is_ended = True
+            self.end_chunk()
+            self._write(bytes_of(DataEnd(0)))
+
     def finish(self) -> None:
-        """The index: nothing is added any more."""
-        self.end_chunk()
-        self._write(bytes_of(DataEnd(0)))
+        """The index, behind the end of the data."""
+        self.end_data()
         begin = self._written_bytes
         summary = RecordBuilder()
         offsets: list[SummaryOffset] = []

@@ -264,6 +264,9 @@ class Segment:
     def finish(self) -> None:
         """Index, sync, rename: the segment is complete and stays so. It is locked until it has its final name."""
         self._table.write(self.begun_ns)
+        self._writer.end_data()
+        # By itself: an index of which a power cut has left zeros is then behind the end of the data, and no loss.
+        self._sink.append(self._writer.take())
         self._writer.finish()
         self._sink.append(self._writer.take())
         self._sink.settle()

@@ -12,7 +12,7 @@ from thermostand.compensation.observations import observe
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Item, StepMark, StepState
 from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, Quality
-from thermostand.recording.exporting.frames_file import frames_rows
+from thermostand.recording.exporting.export import frames_rows
 from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.session import Session
 from thermostand.stand.run import run_virtual
