@@ -31,6 +31,12 @@ def test_each_page_is_made(site: Path):
     assert "troubleshooting.html" in pages
 
 
+def test_the_files_that_are_the_architecture_are_there():
+    rows = re.findall(r"^\| `([^`]+)`", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(rows) == 12
+    assert [row for row in rows if not (ROOT / row).is_file()] == []
+
+
 def test_no_page_loads_anything_from_elsewhere(site: Path):
     loads = re.compile(
         r"""<(?:script|img|iframe)[^>]+src="(https?:)?//|<link[^>]+rel="stylesheet"[^>]+href="(https?:)?//"""
