@@ -10,10 +10,9 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
 
 from thermostand.drivers.camera_preset import CameraPreset
+from thermostand.drivers.devices.kinds import Equipment
 from thermostand.foundation.addresses import tcp_place
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.documents import load_document
@@ -55,60 +54,34 @@ def laboratory_of(
         "chamber_seed": simulation.chamber_seed,
         "faults": list(simulation.faults),
         "bus": address_of(config.bus.address),
-        "chamber": _chamber_of(config, address_of),
-        **_bus_of(config),
-        **_lines_of(config, address_of),
-        "cameras": {
-            name: {
-                "address": None if is_anywhere else camera.address,
-                "serial_number": camera.serial_number,
-                **_dress_of(simulation.cameras.get(name, SimulatedCamera())),
-            }
-            for name, camera in config.cameras.items()
+        "devices": {
+            each.name: {"fake": fake, "settings": _settings_of(each, config, address_of, is_anywhere=is_anywhere)}
+            for each in config.equipment
+            if each.settings is not None and (fake := each.kind.fake(each.settings))
         },
-        "imager": _imager_of(config, is_anywhere=is_anywhere),
         "camera_boot_s": min([_CAMERA_BOOT_S, *(camera.boot_s for camera in config.cameras.values())]),
     }
 
 
-def _bus_of(config: StandConfig) -> dict[str, object]:
-    """What answers on the Modbus line, by unit."""
-    module = config.thermometer_module
-    return {
-        "regulator_unit": config.regulator_unit.unit if config.regulator_unit is not None else None,
-        "relays_unit": config.relays.unit if config.relays is not None else None,
-        "relay_channels": dict(config.relays.channels) if config.relays is not None else {},
-        "heat_module_unit": config.heat_module.unit if config.heat_module is not None else None,
-        "heat_module_output": config.heat_module.channel if config.heat_module is not None else 0,
-        **_inputs_of(config),
-        "thermometers_units": list(module.units),
-        "thermometers_model": "adam4015" if Path(module.registers).stem == "adam-4015" else "m7015",
-        "thermometer_channels": {name: entry.channel for name, entry in config.sensors.items()},
-    }
-
-
-def _lines_of(config: StandConfig, address_of: Callable[[str | None], str | None]) -> dict[str, object]:
-    """What has a line of its own: stages, instruments, the flap's motor."""
-    return {
-        "axes": {
-            name: {
-                "address": address_of(axis.address),
-                "profile": axis.profile if isinstance(axis.profile, str) else axis.profile.model_dump(),
-                "serial_number": axis.serial_number,
-            }
-            for name, axis in config.axes.items()
-        },
-        "probes": {
-            name: probe.model_dump(include={"protocol", "serial_number"}) | {"address": address_of(probe.address)}
-            for name, probe in config.probes.items()
-        },
-        "devices": {
-            name: device.model_dump(mode="json") | {"address": address_of(getattr(device, "address", None))}
-            for name, device in config.devices.items()
-        },
-        "flap": config.flap
-        and {"address": address_of(config.flap.backend_address), "serial_number": config.flap.serial_number},
-    }
+def _settings_of(
+    each: Equipment, config: StandConfig, address_of: Callable[[str | None], str | None], *, is_anywhere: bool
+) -> dict[str, object]:
+    """As the stand's file has them, with the address at which the fake is to answer, and what it needs of the rest."""
+    name, kind, settings = each
+    if kind.section == "cameras":
+        dress = _dress_of(config.simulation.cameras.get(name, SimulatedCamera())) if config.simulation else {}
+        address = None if is_anywhere else settings.address
+        return {"address": address, "serial_number": settings.serial_number, **dress}
+    data: dict[str, object] = settings.model_dump(mode="json")
+    if kind.section == "imager":
+        return data | ({"folder": None} if is_anywhere else {})
+    if kind.address_key:
+        data[kind.address_key] = address_of(getattr(settings, kind.address_key))
+    if kind.section == "thermometer_module":
+        data["channels"] = {name: entry.channel for name, entry in config.sensors.items()}
+    if kind.section == "climate_chamber":
+        data["limits_degC"] = list(settings.limits_at_panel_degC or config.limits.chamber_degC)
+    return data
 
 
 def _dress_of(camera: SimulatedCamera) -> dict[str, object]:
@@ -125,49 +98,14 @@ def _dress_of(camera: SimulatedCamera) -> dict[str, object]:
     }
 
 
-def _inputs_of(config: StandConfig) -> dict[str, object]:
-    """The fake of the digital inputs; those that are well while closed begin so."""
-    contacts = {} if config.inputs is None else config.inputs.contacts
-    return {
-        "inputs_unit": None if config.inputs is None else config.inputs.unit,
-        "input_channels": {name: each.channel for name, each in contacts.items()},
-        "inputs_closed": [each.channel for each in contacts.values() if each.fault_when == "open"],
-    }
-
-
-def _imager_of(config: StandConfig, *, is_anywhere: bool) -> dict[str, object] | None:
-    """The fake imager, which sees each spot where the stand looks for it."""
-    if config.imager is None:
-        return None
-    spots = {name: [spot.x_px, spot.y_px] for name, spot in config.imager.spots.items()}
-    return {"folder": None if is_anywhere else str(config.imager.folder), "spots": spots}
-
-
-def _chamber_of(config: StandConfig, address_of: Callable[[str | None], str | None]) -> dict[str, object] | None:
-    """The fake of a climate chamber, whose controller allows what it should."""
-    chamber = config.climate_chamber
-    if chamber is None:
-        return None
-    known = chamber.model_dump()
-    return {
-        "protocol": known["protocol"],
-        "address": address_of(chamber.address),
-        "unit": known.get("unit") or known.get("chamber") or 1,
-        "limits_degC": list(chamber.limits_at_panel_degC or config.limits.chamber_degC),
-    }
-
-
 def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
     """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses)."""
-    update: dict[str, Any] = {"bus": config.bus.model_copy(update={"address": addresses["bus"]})}
-    for name, kind, settings in config.equipment:
-        if settings is None or not kind.address_key:
-            continue
-        moved = settings.model_validate({**settings.model_dump(exclude_unset=True), kind.address_key: addresses[name]})
-        if kind.device:
-            update[kind.section] = moved
-        else:
-            update.setdefault(kind.section, {})[name] = moved
+    moved = {
+        name: settings.model_validate({**settings.model_dump(exclude_unset=True), kind.address_key: addresses[name]})
+        for name, kind, settings in config.equipment
+        if settings is not None and kind.address_key
+    }
+    update = config.sections_with(moved) | {"bus": config.bus.model_copy(update={"address": addresses["bus"]})}
     simulation = config.simulation
     update["simulation"] = simulation and simulation.model_copy(update={"control": addresses["control"]})
     return config.model_copy(update=update)

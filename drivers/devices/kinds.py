@@ -164,6 +164,8 @@ class DeviceKind:
     what a person does about an error. check: what `stand check` looks at. verbs: what a person may tell it.
     simulated_map: of a unit on the bus, the register map of the one in the simulated laboratory. asks_only: opening it
     writes nothing.
+    fakes: by what the simulated laboratory has it, one for each protocol; its section (the name of an added kind) by
+    default, () for none.
     """
 
     name: str
@@ -183,6 +185,13 @@ class DeviceKind:
     verbs: tuple[Verb, ...] = ()
     simulated_map: str = ""
     asks_only: bool = True
+    fakes: tuple[str, ...] | None = None
+
+    def fake(self, settings: Any) -> str:
+        """By what the simulated laboratory has it; "" where it has nothing of it."""
+        fakes = (self.section if self.section != ADDED else self.name,) if self.fakes is None else self.fakes
+        of_protocol = f"{self.section}.{getattr(settings, 'protocol', '')}"
+        return of_protocol if of_protocol in fakes else next(iter(fakes), "")
 
 
 class Equipment(NamedTuple):

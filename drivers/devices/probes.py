@@ -180,4 +180,12 @@ def _advise(error: DeviceError, name: str, settings: ProbeSettings) -> str:
     return f"compare probes.{name} with the instrument: its protocol, serial number and unit (degC)"
 
 
-KIND = DeviceKind(name="thermometers", settings=ProbeSettings, make=_make, section="probes", rank=50, advise=_advise)
+KIND = DeviceKind(
+    name="thermometers",
+    settings=ProbeSettings,
+    make=_make,
+    section="probes",
+    rank=50,
+    advise=_advise,
+    fakes=tuple(f"probes.{protocol}" for protocol in _LANGUAGES),
+)

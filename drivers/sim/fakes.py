@@ -1,39 +1,113 @@
-"""Fakes that other packages add to the simulated laboratory, for their kinds of devices.
+"""The fakes of a simulated laboratory: which there are, and how each is built from what the stand's file has.
 
-An entry point of the group `thermostand.fakes`, named as the kind, is what makes one: called with the plant, the clock,
-the settings of the device and the laboratory's seed it gives what has `engine()`, a new conversation with it, and
-answers at the device's address. Fakes hold no physics: what they tell comes from the plant.
+Each fake's module states how it is built, under the section of the stand's file that it answers for, and the protocol
+where that section has several: `@fake("climate_chamber.espec")`. Another package adds one by an entry point of the
+group `thermostand.fakes`, named as its kind of device, which is such a function. Fakes hold no physics: what they tell
+comes from the plant.
 """
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import entry_points
-from typing import Protocol, cast
+from typing import Any, Protocol
 
+import thermostand.drivers.sim
 from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.drivers.sim.units.modbus import Unit
 from thermostand.drivers.sim.wire import Engine
 from thermostand.foundation.clock import Now
 
 GROUP = "thermostand.fakes"
 
 
-class FakeDevice(Protocol):
-    """One device."""
+class Bench(Protocol):
+    """The laboratory that is being built. fakes: those that are there, by the name of their device."""
 
-    def engine(self) -> Engine:
-        """A new conversation."""
+    fakes: dict[str, object]
+
+    @property
+    def plant(self) -> Plant:
+        """The physics."""
+        ...
+
+    @property
+    def clock(self) -> Now:
+        """Its time."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Of all that is random."""
+        ...
+
+    @property
+    def has_relays(self) -> bool:
+        """Whether a relay board feeds and permits; without one what would be switched is on."""
+        ...
+
+    def on_bus(self, unit: Unit) -> None:
+        """It answers on the Modbus line."""
+        ...
+
+    def listen(self, name: str, address: str, make_engine: Callable[[], Engine]) -> None:
+        """A wire of its own at that address, with a new engine for each conversation."""
+        ...
+
+    def found_at(self, name: str, address: str, close: Callable[[], None]) -> None:
+        """It answers there, by means of its own."""
         ...
 
 
-Make = Callable[[Plant, Now, Mapping[str, object], int], FakeDevice]
+Build = Callable[[Bench, str, Mapping[str, Any]], object]
 
 
-def added_fake(kind: str) -> Make:
-    """What makes the fake of that kind; ValueError when there is none, or it cannot be loaded."""
-    for point in entry_points(group=GROUP, name=kind):
+@dataclass(frozen=True, slots=True)
+class Fake:
+    """rank: the order in which fakes are built, and so in which those that act on the plant do."""
+
+    build: Build
+    rank: int
+
+
+FAKES: dict[str, Fake] = {}
+
+
+def fake(*keys: str, rank: int) -> Callable[[Build], Build]:
+    """The decorated function builds the fakes of these: the bench, the name of the device, and its settings."""
+
+    def registered(build: Build) -> Build:
+        FAKES.update(dict.fromkeys(keys, Fake(build, rank)))
+        return build
+
+    return registered
+
+
+@cache
+def _load() -> None:
+    root = thermostand.drivers.sim
+    for module in pkgutil.walk_packages(root.__path__, f"{root.__name__}."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+
+
+def fake_of(key: str) -> Fake:
+    """The fake of a section, of one of its protocols, or of another package's kind; ValueError when there is none, or
+    it cannot be loaded."""
+    _load()
+    if key in FAKES:
+        return FAKES[key]
+    for point in entry_points(group=GROUP, name=key):
         try:
-            return cast("Make", point.load())
+            return Fake(point.load(), ADDED)
         except Exception as error:  # importing a stranger's module may raise anything
-            raise ValueError(f"the fake of {kind} cannot be loaded ({error})") from error
-    raise ValueError(f"no package has a fake of a device of kind {kind}")
+            raise ValueError(f"the fake of {key} cannot be loaded ({error})") from error
+    raise ValueError(f"there is no fake of a device of kind {key}")
+
+
+# Ranks. What heats and cools comes first, in the order in which it acts on the plant; then what shares the bus.
+CONTROL, SWITCHES, OUTPUT, MEASURE, CONTACTS, OWN_LINE, ADDED, STAGES, FLAP, PICTURES, CAMERAS = range(11)

@@ -36,11 +36,16 @@ def inject(laboratory: Laboratory, name: str, value: object) -> None:
 def _numbers(laboratory: Laboratory, value: object) -> dict[int, float]:
     """`{"air": 30.0}` by channel numbers."""
     named = TypeAdapter(dict[str, float]).validate_python(value or {})
-    return {laboratory.spec.thermometer_channels[name]: number for name, number in named.items()}
+    return {_sensors(laboratory)[name]: number for name, number in named.items()}
 
 
 def _channel(laboratory: Laboratory, value: object) -> set[int]:
-    return {laboratory.spec.thermometer_channels[str(value)]} if value else set()
+    return {_sensors(laboratory)[str(value)]} if value else set()
+
+
+def _sensors(laboratory: Laboratory) -> dict[str, int]:
+    """The channels of the thermometers, by name."""
+    return laboratory.spec.devices["thermometers"].settings["channels"]
 
 
 def _thermometers(attribute: str, kind: Callable[[Laboratory, object], object]) -> Setter:
@@ -81,10 +86,10 @@ def _silent_relays(laboratory: Laboratory, value: object) -> None:
 
 
 def _change_contact(laboratory: Laboratory, value: object) -> None:
-    spec, closed = laboratory.spec, set(laboratory.spec.inputs_closed)
-    changed = {spec.input_channels[str(value)]} if value else set[int]()
-    if laboratory.inputs is not None and spec.inputs_unit is not None:
-        laboratory.inputs.closed_inputs = closed ^ changed
+    if laboratory.inputs is not None:
+        contacts = laboratory.spec.devices["inputs"].settings["contacts"]
+        closed = {each["channel"] for each in contacts.values() if each["fault_when"] == "open"}
+        laboratory.inputs.closed_inputs = closed ^ ({contacts[str(value)]["channel"]} if value else set[int]())
 
 
 def _alarm_axis(laboratory: Laboratory, value: object) -> None:
@@ -158,7 +163,11 @@ def _link_faults() -> Iterator[tuple[str, Fault]]:
         for kind, (worst, mended, text) in LINK_FAULTS.items():
 
             def apply(laboratory: Laboratory, value: object, link: str = link, kind: str = kind) -> None:
-                set_link_fault(laboratory.link("regulator" if link == "chamber" else link), kind, value)
+                set_link_fault(
+                    laboratory.link("regulator" if link == "chamber" and link not in laboratory.fakes else link),
+                    kind,
+                    value,
+                )
 
             yield f"{link}.{kind}", Fault(apply, worst, mended, text, locks=False)
 

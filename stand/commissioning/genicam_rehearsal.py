@@ -46,7 +46,10 @@ async def rehearse(file: Path, stand: StandConfig | None = None) -> Rehearsal:
     simulated = simulated.model_copy(update={"cameras": {_NAME: settings}, "simulation": simulation})
     laboratory = laboratory_of(simulated, virtual=False, seed=None, is_anywhere=True)
     # nobody switches it on: without a relay board it has power
-    simulator = Simulator({**laboratory, "relays_unit": None, "relay_channels": {}, "camera_boot_s": 0.0})
+    devices = {
+        name: each for name, each in cast("dict[str, object]", laboratory["devices"]).items() if name != "relays"
+    }
+    simulator = Simulator({**laboratory, "devices": devices, "camera_boot_s": 0.0})
     try:
         unplayed = await _unplayed(simulator)
         return await _opened(settings.model_copy(update={"address": simulator.addresses[_NAME]}), unplayed)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -30,11 +31,13 @@ CHAMBER = {"protocol": "espec", "address": "tcp:127.0.0.1:0", "unit": 1, "limits
 def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Laboratory]:
     config = load_config(packaged("", "simulated"))
     described = laboratory_of(config, virtual=True, seed=None, start_ns=START_NS, is_anywhere=True)
-    described["chamber"] = request.param  # beside the regulator, or nothing of its own
-    described["heat_module_unit"] = 9
-    described["imager"] = {"folder": None, "spots": {"lens": [80, 60]}}
-    described["axes"]["linear"]["address"] = f"serial:{tmp_path / 'linear'}"  # type: ignore[index]
-    described["cameras"]["camera"]["address"] = camera_address()  # type: ignore[index]
+    devices = cast("dict[str, Any]", described["devices"])
+    if request.param is not None:
+        devices["chamber"] = {"fake": "climate_chamber.espec", "settings": request.param}
+    devices["heat_module"] = {"fake": "heat_module", "settings": {"unit": 9, "channel": 0}}
+    devices["imager"] = {"fake": "imager", "settings": {"folder": None, "spots": {"lens": {"x_px": 80, "y_px": 60}}}}
+    devices["linear"]["settings"]["address"] = f"serial:{tmp_path / 'linear'}"
+    devices["camera"]["settings"]["address"] = camera_address()
     built = Laboratory(parse_document(json.dumps(described), LaboratorySpec, "laboratory"))
     yield built
     built.close()
@@ -72,7 +75,7 @@ def test_what_is_no_fault_is_refused_by_a_sentence(text: str, word: str):
 
 def test_each_fault_of_the_table_is_set_and_mended(laboratory: Laboratory):
     for name, fault in FAULTS.items():
-        if name.startswith("chamber.") and laboratory.spec.chamber is None:
+        if name.startswith("chamber.") and "chamber" not in laboratory.fakes:
             with pytest.raises(ValueError, match="has no"):
                 inject(laboratory, name, fault.worst)
             continue
@@ -103,7 +106,7 @@ def test_time_without_a_plan_moves_as_before(laboratory: Laboratory):
 
 
 def test_a_plan_for_a_device_that_is_not_there_is_refused(laboratory: Laboratory):
-    laboratory.axes.pop("rotary")
+    laboratory.fakes.pop("rotary")
     for text in ("rotary.restart", "axis.alarm=rotary@2h", 'thermometer.offset_K={"roof": 1}@10'):
         with pytest.raises(ConfigError, match=r"rotary|roof"):
             FaultSchedule(laboratory, [parse_fault(text)])

@@ -12,6 +12,8 @@ import pytest
 import yaml
 
 from thermostand.drivers.devices.checking import Finding
+from thermostand.drivers.devices.kinds import built_in
+from thermostand.drivers.sim.fakes import FAKES, fake_of
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
@@ -96,11 +98,9 @@ from thermostand.drivers.sim.wire import Lines
 
 
 class FakeLamp:
-    def __init__(self, plant, clock, settings, seed):
+    def __init__(self, bench, name, settings):
         self.percent = 0.0
-
-    def engine(self):
-        return Lines(self.answer)
+        bench.listen(name, settings["address"], lambda: Lines(self.answer))
 
     def answer(self, line):
         if line.strip() != b"?":
@@ -140,6 +140,13 @@ def stand_with(**device: object) -> StandConfig:
     data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
     data["devices"] = {"beam": {"kind": "lamp", "address": "tcp:127.0.0.1:15099", **device}}
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
+
+
+def test_each_kind_of_device_has_its_fake_and_each_fake_its_kind():
+    settings = {kind.section: kind.fakes if kind.fakes is not None else (kind.section,) for kind in built_in()}
+    settings["regulator"] = ("regulator",)  # of the two kinds in that section, one has nothing to be simulated
+    fake_of("relays")
+    assert sorted(FAKES) == sorted(key for keys in settings.values() for key in keys)
 
 
 @pytest.fixture

@@ -37,8 +37,8 @@ def three_of(*, still: bool, **size_px: int) -> Generator[StandConfig]:
         data["cameras"][name] = {"address": f"127.0.0.{41 + number}", "serial_number": f"TS-{number}", **size}
     config = StandConfig.model_validate(data)
     laboratory: dict[str, Any] = laboratory_of(config, virtual=False, seed=None, is_anywhere=True)
-    for camera in laboratory["cameras"].values():
-        camera["still"] = still
+    for name in config.cameras:
+        laboratory["devices"][name]["settings"]["still"] = still
     simulator = Simulator(laboratory)
     try:
         yield relocated(config, simulator.addresses)

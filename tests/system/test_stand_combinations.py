@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import yaml
@@ -265,8 +265,10 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
         *(name for name in ("flap", "heat_module", "inputs", "imager") if name in data),
         *(name for key in ("axes", "cameras", "probes") for name in data.get(key, {})),
     }
-    channels = laboratory_of(config, virtual=True, seed=1)["thermometer_channels"]
-    assert channels == {name: each.channel for name, each in config.sensors.items()}
+    described = cast("dict[str, Any]", laboratory_of(config, virtual=True, seed=1)["devices"])
+    assert described["thermometers"]["settings"]["channels"] == {
+        name: each.channel for name, each in config.sensors.items()
+    }
     assert len(config.sensors) == len(data["thermometers"])
 
 

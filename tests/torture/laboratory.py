@@ -63,8 +63,8 @@ class ObservedLaboratory(Laboratory):
         values = [plant.flap_open_at(time_ns) if name == "flap_open" else float(getattr(plant, name)) for name in TRUTH]
         self._truth.write(ROW.pack(time_ns, *values))
 
-    def _listen(self, name, address, make_engine) -> None:
-        super()._listen(name, address, make_engine)
+    def listen(self, name, address, make_engine) -> None:
+        super().listen(name, address, make_engine)
         faults = self._links[name].faults
         apply = faults.apply
 

@@ -277,4 +277,5 @@ KIND = DeviceKind(
     advise=_advise,
     check=check_controller,
     verbs=CONTROL,
+    fakes=tuple(f"climate_chamber.{protocol}" for protocol in LANGUAGES),
 )

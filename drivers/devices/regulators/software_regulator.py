@@ -315,5 +315,6 @@ KIND = DeviceKind(
     rank=35,  # after the thermometers, of which it shows what was read
     address_key="",
     check=_check,
+    fakes=(),
     verbs=(*CONTROL, Verb("autotune", _AUTOTUNE, _autotune, CONTROL[0].arguments)),
 )

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from thermostand.drivers.sim.usb import Stall, TimedOut
+from thermostand.drivers.sim.fakes import FLAP, Bench, fake
+from thermostand.drivers.sim.usb import Stall, TimedOut, UsbServer
+from thermostand.foundation.addresses import tcp_place
 from thermostand.foundation.clock import NS_PER_S, Now
 
 if TYPE_CHECKING:
@@ -314,3 +317,11 @@ def _delivered() -> bytearray:
     for offset, (kind, value) in DELIVERED_SETTINGS.items():
         struct.pack_into(f"<{kind}", block, offset, value)
     return block
+
+
+@fake("flap", rank=FLAP)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeFlap:
+    flap = FakeFlap(bench.plant, bench.clock, settings["serial_number"])
+    bus = UsbServer(*tcp_place(settings["backend_address"] or "", may_be_free=True), [flap])
+    bench.found_at(name, bus.address, bus.close)
+    return flap

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 
 from thermostand.drivers.framing.ximc import Damage, Frame, decode, encode
+from thermostand.drivers.sim.fakes import STAGES, Bench, fake
 from thermostand.drivers.sim.motion import ximc_table as table
 from thermostand.drivers.sim.motion.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Run, Shift, Stepper
 from thermostand.drivers.sim.motion.ximc_settings import Settings
 from thermostand.foundation.clock import Now
+from thermostand.foundation.documents import Document
 
 if TYPE_CHECKING:
     from thermostand.drivers.sim.physics.plant import Plant
@@ -393,3 +396,58 @@ class FakeAxis:
         if travel.leg is not None:
             return table.PWR_NORMAL
         return self._settings.resting_power(time_ns - travel.rest_ns)
+
+
+PROFILES = {"8MT160-300": table.LINEAR_8MT160_300, "8MR151": table.ROTARY_8MR151}
+
+
+class StageSpec(Document, extra="ignore"):
+    """Another stage, in mm or degrees, full steps/s and full steps/s2."""
+
+    unit_per_step: float
+    travel: float
+    speed: float
+    acceleration: float
+    deceleration: float
+    homing_speed: float
+    power_off_s: float | None
+
+    @property
+    def profile(self) -> table.Profile:
+        """As the two stages of this kind that are known, a switch at each end."""
+        stage = table.LINEAR_8MT160_300
+        move, power, homing = (stage.settings[name] for name in ("mov", "pwr", "hom"))
+        is_off = self.power_off_s is not None
+        settings = {
+            "mov": (round(self.speed), 0, round(self.acceleration), round(self.deceleration), *move[4:]),
+            "pwr": (*power[:2], round(self.power_off_s or 0), power[3], 7 if is_off else 5),
+            "hom": (round(self.homing_speed), 0, round(self.homing_speed), *homing[3:]),
+        }
+        end_steps = round(self.travel / self.unit_per_step)
+        switches = replace(stage.switches, right=end_steps - 500)
+        return replace(
+            stage, unit_per_step=self.unit_per_step, switches=switches, settings={**stage.settings, **settings}
+        )
+
+
+class AxisSpec(Document, extra="ignore"):
+    """A stage: where its controller answers and which profile it was delivered with, by name or written out."""
+
+    address: str
+    profile: Literal["8MT160-300", "8MR151"] | StageSpec
+    serial_number: int
+
+    @property
+    def stage(self) -> table.Profile:
+        """The profile itself."""
+        return self.profile.profile if isinstance(self.profile, StageSpec) else PROFILES[self.profile]
+
+
+@fake("axes", rank=STAGES)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeAxis:
+    spec = AxisSpec.model_validate(settings)
+    if name not in ("linear", "rotary"):
+        raise ValueError(f"the simulated table has linear and rotary, and no axis {name}")
+    axis = FakeAxis(bench.plant, bench.clock, spec.stage, spec.serial_number, name)
+    bench.listen(name, spec.address, axis.engine)
+    return axis

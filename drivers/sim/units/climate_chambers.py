@@ -7,10 +7,11 @@ is said at its class. The control is proportional over 3 K. None has a watchdog 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
+from thermostand.drivers.sim.fakes import CONTROL, Bench, fake
 from thermostand.drivers.sim.units.modbus import Timeline
 from thermostand.foundation.clock import NS_PER_S, Now
 
@@ -313,3 +314,31 @@ class FakeWeiss(FakeClimateChamber):
         ]
         digits = f"0{int(self.running)}{int(self.humidity_on)}" + 29 * "0"
         return " ".join([*(f"{value:06.1f}" for pair in pairs for value in pair), digits])
+
+
+Made = TypeVar("Made", bound=FakeClimateChamber)
+
+
+def built(bench: Bench, name: str, settings: Mapping[str, Any], chamber: Made) -> Made:
+    """At its address; its controller allows the set-points that it should."""
+    chamber.is_alone = not bench.has_relays
+    low_degC, high_degC = settings["limits_degC"]
+    chamber.limits_degC = low_degC, high_degC
+    bench.listen(name, settings["address"], chamber.engine)
+    return chamber
+
+
+@fake("climate_chamber.espec", rank=CONTROL)
+def _build_espec(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeEspec:
+    return built(bench, name, settings, FakeEspec(bench.plant, bench.clock))
+
+
+@fake("climate_chamber.cts", rank=CONTROL)
+def _build_cts(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeCts:
+    is_serial = settings["address"].startswith("serial:")
+    return built(bench, name, settings, FakeCts(bench.plant, bench.clock, settings["unit"], is_serial=is_serial))
+
+
+@fake("climate_chamber.ascii2", rank=CONTROL)
+def _build_ascii2(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeWeiss:
+    return built(bench, name, settings, FakeWeiss(bench.plant, bench.clock, settings["unit"]))

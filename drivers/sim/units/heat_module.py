@@ -8,10 +8,11 @@ a write is answered that is ignored since the watchdog has tripped.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
+from thermostand.drivers.sim.fakes import OUTPUT, Bench, fake
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
@@ -255,3 +256,10 @@ class FakeHeatModule:
         if self.coils[ENGINEERING]:
             return round(current_mA * 1000)
         return round(min(1.0, max(0.0, (current_mA - low_mA) / (high_mA - low_mA))) * HEX_FULL_SCALE)
+
+
+@fake("heat_module", rank=OUTPUT)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeHeatModule:
+    module = FakeHeatModule(bench.plant, bench.clock, settings["unit"], settings["channel"])
+    bench.on_bus(module)
+    return module

@@ -4,8 +4,11 @@ status and error messages); an `out` command is not answered, and is valid in re
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
-from thermostand.drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber
+from thermostand.drivers.sim.fakes import CONTROL, Bench, fake
+from thermostand.drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber, built
 from thermostand.foundation.clock import Now
 
 _VERSION = "JULABO TEST 1.0 V 1.20"
@@ -98,3 +101,8 @@ class FakeJulabo(FakeClimateChamber):
             self.switch(found[1] == "1")
             return ""
         return _INVALID
+
+
+@fake("climate_chamber.julabo", rank=CONTROL)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeJulabo:
+    return built(bench, name, settings, FakeJulabo(bench.plant, bench.clock))

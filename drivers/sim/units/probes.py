@@ -7,8 +7,10 @@ p. 90-102 (commands end with CR; SEND, the default output). The serial numbers a
 from __future__ import annotations
 
 import random
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
+from thermostand.drivers.sim.fakes import OWN_LINE, Bench, fake
 from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.foundation.clock import Now
 
@@ -80,3 +82,11 @@ class ProbeEngine:
             for command in commands
         )
         return "".join(replies).encode("latin-1")
+
+
+@fake("probes.hart", "probes.vaisala", rank=OWN_LINE)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeProbe:
+    serial_number = settings["serial_number"] or "P-1"
+    probe = FakeProbe(bench.plant, bench.clock, settings["protocol"], serial_number, bench.seed)
+    bench.listen(name, settings["address"], probe.engine)
+    return probe

@@ -6,11 +6,12 @@ the plant; nothing depends on when the registers are read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
+from thermostand.drivers.sim.fakes import CONTROL, Bench, fake
 from thermostand.drivers.sim.units import self_tuning
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
@@ -408,3 +409,10 @@ class FakeRegulator:
 def _signed(mv_pct: float) -> Outputs:
     """A signed manipulated value (negative = cooling) as two outputs."""
     return Outputs(max(0.0, mv_pct), max(0.0, -mv_pct))
+
+
+@fake("regulator", rank=CONTROL)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeRegulator:
+    unit = FakeRegulator(bench.plant, bench.clock, settings["unit"])
+    bench.on_bus(unit)
+    return unit

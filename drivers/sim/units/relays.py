@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
+from thermostand.drivers.sim.fakes import CONTACTS, SWITCHES, Bench, fake
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
@@ -224,3 +225,22 @@ class FakeRelays:
 def _check_span(address: int, count: int) -> None:
     if address + count > RELAYS:
         raise Refusal(ILLEGAL_ADDRESS)
+
+
+@fake("relays", rank=SWITCHES)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeRelays:
+    board = FakeRelays(bench.plant, bench.clock, settings["unit"], settings["channels"])
+    bench.on_bus(board)
+    return board
+
+
+@fake("inputs", rank=CONTACTS)
+def _build_inputs(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeRelays:
+    """Those of the relay board, or of a board of its own. Contacts that are well while closed begin so."""
+    board = bench.fakes.get("relays")
+    if not isinstance(board, FakeRelays) or board.unit != settings["unit"]:
+        board = FakeRelays(bench.plant, bench.clock, settings["unit"], {})
+        bench.on_bus(board)
+    contacts = settings["contacts"].values()
+    board.closed_inputs = {each["channel"] for each in contacts if each["fault_when"] == "open"}
+    return board

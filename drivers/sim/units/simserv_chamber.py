@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
-from thermostand.drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber
+from thermostand.drivers.sim.fakes import CONTROL, Bench, fake
+from thermostand.drivers.sim.units.climate_chambers import Chamber, Conversation, FakeClimateChamber, built
 from thermostand.foundation.clock import Now
 
 _ACCEPTED, _NO_COMMAND, _BAD_PARAMETER, _NO_CHANNEL = "1", "-5", "-6", "-8"
@@ -90,3 +93,8 @@ class FakeSimserv(FakeClimateChamber):
                 return _NO_CHANNEL
             case _:
                 return _NO_COMMAND
+
+
+@fake("climate_chamber.simserv", rank=CONTROL)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeSimserv:
+    return built(bench, name, settings, FakeSimserv(bench.plant, bench.clock, settings["chamber"]))

@@ -6,12 +6,13 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from thermostand.drivers.sim.fakes import PICTURES, Bench, fake
 from thermostand.drivers.sim.units.modbus import Timeline
 from thermostand.drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
@@ -128,3 +129,13 @@ class FakeThermalImager:
             near = (columns - x) ** 2 + (rows - y) ** 2 <= SPOT_RADIUS_px**2
             celsius[near] += seen.get(name, sight.chamber_degC) - sight.chamber_degC
         return celsius
+
+
+@fake("imager", rank=PICTURES)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeThermalImager:
+    """folder: None for one of its own. It sees each spot where the stand looks for it."""
+    folder = None if settings["folder"] is None else Path(settings["folder"])
+    spots = {spot: (each["x_px"], each["y_px"]) for spot, each in settings["spots"].items()}
+    imager = FakeThermalImager(bench.plant, folder, spots, bench.seed)
+    bench.found_at(name, str(imager.folder), imager.close)
+    return imager

@@ -7,7 +7,11 @@ The type codes and the name bytes were not confirmed on a module.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
+from thermostand.drivers.sim.fakes import MEASURE, Bench, fake
+from thermostand.drivers.sim.units.adam_4015 import FakeAdam4015
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
@@ -142,3 +146,16 @@ class FakeThermometers(RtdModule):
 
 def _signed(word: int) -> int:
     return word - 0x10000 if word & 0x8000 else word
+
+
+@fake("thermometer_module", rank=MEASURE)
+def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> tuple[RtdModule, ...]:
+    """A module for each unit of the make that the register map names. channels: of the sensors, by name."""
+    make = FakeAdam4015 if Path(settings["registers"]).stem == "adam-4015" else FakeThermometers
+    modules: list[FakeThermometers | FakeAdam4015] = []
+    for number, unit in enumerate((settings["unit"], *settings["further_units"])):
+        first = number * CHANNELS
+        here = {sensor: at for sensor, at in settings["channels"].items() if first <= at < first + CHANNELS}
+        modules.append(make(bench.plant, bench.clock, unit, here, bench.seed, first))
+        bench.on_bus(modules[-1])
+    return tuple(modules)
