@@ -51,7 +51,7 @@ def worst(findings: Iterable[Finding]) -> Verdict:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class DeviceLook:
     """A look at one device. settings: None where it is a stand-in. advise: what a person does about an error. made: all
     devices of the stand, by name; opened: the names of those that answer. of_section, map_of: as `kinds.Around` has
     them. is_powered_later: cameras without supply are looked at once they have it."""
@@ -130,12 +130,12 @@ class Look:
         return f"set the unit as its register map {unit.registers} says, or take the map of the unit that is there"
 
 
-async def check_answers(look: Look) -> None:
+async def check_answers(look: DeviceLook) -> None:
     """What there is to look at in most devices."""
     await look.answers()
 
 
-async def check_controller(look: Look) -> None:
+async def check_controller(look: DeviceLook) -> None:
     """Of what holds the chamber's temperature: whether what is written to it is what it goes to, and how that is known;
     and that nothing controls now."""
     readings = await look.answers()
@@ -147,7 +147,7 @@ async def check_controller(look: Look) -> None:
         look.warn("it controls, though no program has this stand", "stop it, unless you want it so")
 
 
-async def _check_in_force(look: Look, controller: Controller) -> None:
+async def _check_in_force(look: DeviceLook, controller: Controller) -> None:
     try:
         found = await controller.in_force()
     except DeviceError as error:

@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import Look
+from thermostand.drivers.devices.checking import DeviceLook
 from thermostand.drivers.devices.kinds import Around, DeviceKind
 from thermostand.drivers.settings import DeviceName, Identity, Line, OnBus
 from thermostand.drivers.wires.bus import Bus
@@ -93,7 +93,7 @@ def _make(name: str, settings: InputsSettings, around: Around) -> Inputs:
     return Inputs(name, around.bus, around.map_of("inputs", settings), channels, around.clock)
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """Whether each contact is as it is while all is well."""
     readings = await look.answers()
     for name, contact in look.settings.contacts.items():

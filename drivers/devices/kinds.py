@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
 import thermostand.drivers.devices
-from thermostand.drivers.devices.checking import Look, check_answers
+from thermostand.drivers.devices.checking import DeviceLook, check_answers
 from thermostand.drivers.devices.protocols import Sensor
 from thermostand.drivers.settings import OnBus
 from thermostand.drivers.wires.bus import Bus
@@ -54,7 +54,7 @@ class Around:
     map_of: Callable[[str, OnBus], RegisterMap]
 
 
-class Place(NamedTuple):
+class LockedPlace(NamedTuple):
     """Where a device is found, which no two runs may use at once. wire: a serial or TCP address; host: of what answers
     at one; number: what a real device is known by wherever it is; name: as it is."""
 
@@ -62,7 +62,7 @@ class Place(NamedTuple):
     text: str
 
 
-class Argument(NamedTuple):
+class VerbNumber(NamedTuple):
     """A number that a verb takes, with its unit and bounds; the default is for one that is not given."""
 
     name: str
@@ -120,11 +120,11 @@ class Verb:
     name: str
     text: str
     act: Callable[[Hands, str, Arguments], Work]
-    arguments: Callable[[Any, OfSection], tuple[Argument, ...]] = lambda settings, of_section: ()
+    arguments: Callable[[Any, OfSection], tuple[VerbNumber, ...]] = lambda settings, of_section: ()
 
 
-def _set_points(settings: object, of_section: OfSection) -> tuple[Argument, ...]:
-    return (Argument("setpoint_degC", "degC", *of_section("limits").chamber_degC),)
+def _set_points(settings: object, of_section: OfSection) -> tuple[VerbNumber, ...]:
+    return (VerbNumber("setpoint_degC", "degC", *of_section("limits").chamber_degC),)
 
 
 CONTROL = (
@@ -134,17 +134,20 @@ CONTROL = (
 """What a person may tell whatever holds the chamber's temperature."""
 
 
-class Missing(NamedTuple):
-    """What a stand has not, and what follows from that, as parts of a sentence."""
+class Absence(NamedTuple):
+    """What a stand has not, and what follows from that; as a text both, in a sentence."""
 
     what: str
     means: str
 
+    def __str__(self) -> str:
+        return f"no {self.what}: {self.means}"
 
-def _places(settings: Any) -> Iterable[Place]:
+
+def _places(settings: Any) -> Iterable[LockedPlace]:
     """Its address, if it has one of its own."""
     address = getattr(settings, "address", None)
-    return () if address is None else (Place("wire", address),)
+    return () if address is None else (LockedPlace("wire", address),)
 
 
 def _advise(error: DeviceError, name: str, settings: Any) -> str:
@@ -175,13 +178,13 @@ class DeviceKind:
     device: str = ""
     rank: int = 85
     is_opened: bool = True
-    places: Callable[[Any], Iterable[Place]] = _places
+    places: Callable[[Any], Iterable[LockedPlace]] = _places
     address_key: str = "address"
     stand_in: Callable[[str, Clock], Sensor] | None = None
     stand_in_s: float | None = None
-    missing: Missing | None = None
+    missing: Absence | None = None
     advise: Callable[[DeviceError, str, Any], str] = _advise
-    check: Callable[[Look], Coroutine[None, None, None]] = check_answers
+    check: Callable[[DeviceLook], Coroutine[None, None, None]] = check_answers
     verbs: tuple[Verb, ...] = ()
     simulated_map: str = ""
     asks_only: bool = True

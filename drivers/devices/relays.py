@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import Look
-from thermostand.drivers.devices.kinds import Around, DeviceKind, Missing
+from thermostand.drivers.devices.checking import DeviceLook
+from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind
 from thermostand.drivers.settings import Identity, OnBus, PollPeriod_s
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
@@ -209,7 +209,7 @@ def _make(name: str, settings: RelaysSettings, around: Around) -> Relays:
     return Relays(name, around.bus, around.map_of("relays", settings), channels)
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """Its points, and that nothing is on that should not be."""
     if look.settings is None:
         look.opened.add(look.name)
@@ -235,6 +235,6 @@ KIND = DeviceKind(
     simulated_map="waveshare-relay",
     stand_in=NoRelays,
     stand_in_s=5.0,
-    missing=Missing("relay board", "nothing of the stand's own ends the heat, and cameras stay on"),
+    missing=Absence("relay board", "nothing of the stand's own ends the heat, and cameras stay on"),
     check=_check,
 )

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from thermostand.drivers.devices.checking import Finding, Look
+from thermostand.drivers.devices.checking import DeviceLook, Finding
 from thermostand.drivers.devices.kinds import Around, DeviceKind
 from thermostand.drivers.devices.protocols import Sensor
 from thermostand.drivers.settings import Identity, Line, OnBus, Range
@@ -264,7 +264,7 @@ async def _each_other(thermometers: Sensor, regulator: Sensor | None, warn_K: fl
     return Finding(thermometers.name, "each other", "ok", text, data=data)
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """The module, each thermometer, and all of them against each other."""
     if await look.answers():
         await look.points(f"value_{each.channel}" for each in look.of_section("thermometers").values())

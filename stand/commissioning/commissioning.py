@@ -16,7 +16,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, suppress
 from functools import partial
 
-from thermostand.drivers.devices.checking import Add, Finding, Look
+from thermostand.drivers.devices.checking import Add, DeviceLook, Finding
 from thermostand.drivers.devices.kinds import Equipment
 from thermostand.drivers.settings import Identity
 from thermostand.foundation.errors import DeviceError, InUse, Unreachable
@@ -67,7 +67,7 @@ async def _looks(assembly: Assembly, add: Add, *, has_moves: bool) -> AsyncItera
         name, kind, settings = each
         device = assembly.devices.every[name]
         await kind.check(
-            Look(
+            DeviceLook(
                 device=device,
                 settings=settings,
                 section=kind.section,

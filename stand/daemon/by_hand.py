@@ -63,7 +63,7 @@ class ByHand:
         given = {each.name: _number(arguments.get(each.name, each.default), each.name) for each in takes.values()}
         return verbs[verb].act(self, name, given)
 
-    def _takes(self, name: str, verb: Verb) -> tuple[kinds.Argument, ...]:
+    def _takes(self, name: str, verb: Verb) -> tuple[kinds.VerbNumber, ...]:
         return verb.arguments(self._equipment[name].settings, partial(getattr, self._assembly.config))
 
     # As drivers.devices.kinds.Hands.
@@ -126,7 +126,7 @@ class ByHand:
         price(number_steps([step]), self._assembly.config)
 
 
-def _verb(verb: Verb, takes: Iterable[kinds.Argument]) -> DeviceVerb:
+def _verb(verb: Verb, takes: Iterable[kinds.VerbNumber]) -> DeviceVerb:
     """As it is published."""
     arguments = (Argument(name=name, unit=unit, minimum=low, maximum=high) for name, unit, low, high, _ in takes)
     return DeviceVerb(verb=verb.name, text=verb.text, arguments=tuple(arguments))

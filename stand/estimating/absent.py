@@ -3,20 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
-from thermostand.drivers.devices.kinds import built_in
+from thermostand.drivers.devices.kinds import Absence, built_in
 from thermostand.stand.config.stand_config import StandConfig
-
-
-class Absence(NamedTuple):
-    """What a stand has not, and what follows from that; as a text both, in a sentence."""
-
-    what: str
-    means: str
-
-    def __str__(self) -> str:
-        return f"no {self.what}: {self.means}"
 
 
 def absences(config: StandConfig) -> tuple[Absence, ...]:
@@ -28,7 +17,7 @@ def _absences(config: StandConfig) -> Iterator[Absence]:
     there = {each.kind for each in config.equipment if each.settings is not None}
     for kind in built_in():
         if kind.missing is not None and kind not in there:
-            yield Absence(*kind.missing)
+            yield kind.missing
     if config.relays is not None and "compressor" not in config.relays.channels:
         yield Absence("compressor", "it cools by losing heat only, so not below the laboratory's temperature")
     if config.cameras and all(not camera.has_temperature for camera in config.cameras.values()):

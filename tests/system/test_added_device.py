@@ -36,7 +36,7 @@ MODULE = '''
 import asyncio
 from typing import Literal
 
-from thermostand.drivers.devices.kinds import Argument, DeviceKind, Verb
+from thermostand.drivers.devices.kinds import VerbNumber, DeviceKind, Verb
 from thermostand.drivers.settings import Identity, Polled
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.drivers.wires.link import SerialSettings
@@ -88,7 +88,7 @@ KIND = DeviceKind(
             "shine",
             "give light",
             lambda stand, name, given: stand.device(name).shine(given["percent"]),
-            lambda settings, of_section: (Argument("percent", "%", 0.0, settings.most_percent),),
+            lambda settings, of_section: (VerbNumber("percent", "%", 0.0, settings.most_percent),),
         ),
     ),
 )

@@ -17,8 +17,8 @@ from pydantic import Discriminator, Tag
 
 import thermostand.drivers.devices.cameras
 from thermostand.drivers.devices.cameras.shared_line import camera_lines, on_line
-from thermostand.drivers.devices.checking import Add, Finding, Look
-from thermostand.drivers.devices.kinds import Argument, Around, DeviceKind, Missing, Place, Verb
+from thermostand.drivers.devices.checking import Add, DeviceLook, Finding
+from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, LockedPlace, Verb, VerbNumber
 from thermostand.drivers.devices.protocols import Camera
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.drivers.settings import CameraSettings
@@ -79,10 +79,10 @@ def _make(name: str, settings: CameraSettings, around: Around) -> Camera:
     return driver.Camera(name, on_line(settings, around.of_section("cameras").values()), around.clock)
 
 
-def _places(settings: CameraSettings) -> Iterator[Place]:
-    yield Place("host", settings.address)
+def _places(settings: CameraSettings) -> Iterator[LockedPlace]:
+    yield LockedPlace("host", settings.address)
     if settings.serial_number is not None:
-        yield Place("number", f"camera {settings.serial_number}")
+        yield LockedPlace("number", f"camera {settings.serial_number}")
 
 
 def _advise(error: DeviceError, name: str, settings: CameraSettings) -> str:
@@ -109,7 +109,7 @@ def packet_finding(name: str, address: str, packet_size: int) -> Finding:
     return Finding(name, "packets", "ok", text, data=data)
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """Its settings, its temperature and its line; one without supply is left alone."""
     await _check_powered(look)
     for finding in line_findings(look.of_section("cameras"), look.name):
@@ -125,7 +125,7 @@ def line_findings(cameras: Mapping[str, CameraSettings], name: str) -> Iterator[
             yield Finding(name, "line", "ok" if fits else "failed", text, "" if fits else _ADVICE, asdict(line))
 
 
-async def _check_powered(look: Look) -> None:
+async def _check_powered(look: DeviceLook) -> None:
     if not await _has_supply(look):
         if not look.is_powered_later:
             text = "its supply is off, so it was not asked"
@@ -154,7 +154,7 @@ async def check_settings(camera: Camera, add: Add) -> None:
         add(packet_finding(camera.name, camera.settings.address, packet_size))
 
 
-async def _has_supply(look: Look) -> bool:
+async def _has_supply(look: DeviceLook) -> bool:
     """As far as the relays tell."""
     if "relays" not in look.opened:
         return True
@@ -173,7 +173,7 @@ KIND = DeviceKind(
     rank=90,
     is_opened=False,  # when it has its supply
     places=_places,
-    missing=Missing("cameras", "a recipe that takes frames is refused"),
+    missing=Absence("cameras", "a recipe that takes frames is refused"),
     advise=_advise,
     check=_check,
     verbs=(
@@ -185,7 +185,7 @@ KIND = DeviceKind(
             "frame",
             "take one frame",
             lambda stand, _, given: stand.take_frame(given["exposure_s"]),
-            lambda camera, _: (Argument("exposure_s", "s", 0.0, LONGEST_EXPOSURE_S, camera.exposure_s),),
+            lambda camera, _: (VerbNumber("exposure_s", "s", 0.0, LONGEST_EXPOSURE_S, camera.exposure_s),),
         ),
     ),
 )

@@ -19,7 +19,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from thermostand.drivers.devices.checking import Finding, Look
+from thermostand.drivers.devices.checking import DeviceLook, Finding
 from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
 from thermostand.drivers.devices.imager.radiometry import temperatures_degC
 from thermostand.drivers.devices.kinds import Around, DeviceKind
@@ -395,7 +395,7 @@ def _of_picture(settings: ThermalImagerSettings, file: Path, image: RadiometricI
     return Finding("imager", "reading", "ok", f"{which}; its newest picture, {file.name}, shows {texts}", data=seen)
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """Not opened: what its folder has, and what the newest picture shows."""
     look.add(await asyncio.to_thread(imager_finding, look.settings))
 

@@ -14,8 +14,8 @@ import usb.core
 import usb.util
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import Look
-from thermostand.drivers.devices.kinds import Around, DeviceKind, Missing, Place, Verb
+from thermostand.drivers.devices.checking import DeviceLook
+from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, LockedPlace, Verb
 from thermostand.drivers.devices.motion.motion import Motion, Turn
 from thermostand.drivers.settings import Identity, Polled, same_device
 from thermostand.foundation.addresses import TcpAddress
@@ -440,11 +440,11 @@ def _make(name: str, settings: FlapSettings, around: Around) -> Flap:
     return Flap(name, settings, around.clock, backend)
 
 
-def _places(settings: FlapSettings) -> Iterator[Place]:
+def _places(settings: FlapSettings) -> Iterator[LockedPlace]:
     if settings.backend_address is None:
-        yield Place("name", f"usb {settings.serial_number}")
+        yield LockedPlace("name", f"usb {settings.serial_number}")
     else:
-        yield Place("wire", settings.backend_address)
+        yield LockedPlace("wire", settings.backend_address)
 
 
 def _advise(error: DeviceError, name: str, settings: FlapSettings) -> str:
@@ -453,7 +453,7 @@ def _advise(error: DeviceError, name: str, settings: FlapSettings) -> str:
     return "is something in its way? its counts are of the feedback: compare open_target, closed_target and travel_s"
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """Its controller, and where it stands."""
     if look.settings is None:
         look.found("link", "ok", "no flap: cameras see the target all the time")
@@ -471,7 +471,7 @@ KIND = DeviceKind(
     places=_places,
     address_key="backend_address",
     stand_in=NoFlap,
-    missing=Missing("flap", "cameras see the target all the time; what opens or closes it takes no time"),
+    missing=Absence("flap", "cameras see the target all the time; what opens or closes it takes no time"),
     advise=_advise,
     check=_check,
     verbs=(

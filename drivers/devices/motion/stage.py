@@ -14,7 +14,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.kinds import Argument, Around, DeviceKind, Missing, Place, Verb
+from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, LockedPlace, Verb, VerbNumber
 from thermostand.drivers.devices.motion.motion import Motion, Turn
 from thermostand.drivers.devices.motion.stage_profiles import PROFILES, ProfileName, StageProfile
 from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
@@ -447,15 +447,15 @@ KIND = DeviceKind(
     make=_make,
     section="axes",
     rank=80,
-    places=lambda axis: (Place("wire", axis.address), Place("number", f"stage {axis.serial_number}")),
-    missing=Missing("stages", "a recipe that moves one is refused"),
+    places=lambda axis: (LockedPlace("wire", axis.address), LockedPlace("number", f"stage {axis.serial_number}")),
+    missing=Absence("stages", "a recipe that moves one is refused"),
     advise=_advise,
     verbs=(
         Verb(
             "move",
             "move to a position",
             lambda stand, name, given: stand.move_axis(name, given["position"]),
-            lambda axis, _: (Argument("position", axis.unit, *axis.limits),),
+            lambda axis, _: (VerbNumber("position", axis.unit, *axis.limits),),
         ),
         Verb("stop", "stop where it is", lambda stand, name, given: stand.stop_axis(name)),
         Verb("home", "find the home switch", lambda stand, name, given: stand.home_axis(name)),

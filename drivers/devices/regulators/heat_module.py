@@ -12,7 +12,7 @@ from typing import NoReturn, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import Look
+from thermostand.drivers.devices.checking import DeviceLook
 from thermostand.drivers.devices.exclusive import Exclusive
 from thermostand.drivers.devices.kinds import Around, DeviceKind
 from thermostand.drivers.devices.relays import COIL_OFF, COIL_ON
@@ -342,7 +342,7 @@ def _make(name: str, settings: HeatModuleSettings, around: Around) -> HeatModule
     return HeatModule(unit, settings, around.clock)
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """Opened as a run does it."""
     await look.answers()
     places = ("output", "present", "safe", "power_on", "type_code")

@@ -15,7 +15,7 @@ from typing import Literal, cast
 
 from pydantic import Field
 
-from thermostand.drivers.devices.checking import Look
+from thermostand.drivers.devices.checking import DeviceLook
 from thermostand.drivers.devices.kinds import CONTROL, Arguments, Around, DeviceKind, Hands, Verb
 from thermostand.drivers.devices.protocols import HeatOutput, InForce, Switches
 from thermostand.drivers.devices.regulators import pid, relay_tuning
@@ -297,7 +297,7 @@ async def _autotune(stand: Hands, name: str, given: Arguments) -> None:
     await stand.device(name).autotune()
 
 
-async def _check(look: Look) -> None:
+async def _check(look: DeviceLook) -> None:
     """Nothing is opened: what it measures and heats by is looked at by itself."""
     look.opened.add(look.name)
     by = "heat_module" if "heat_module" in look.made else f"relays.{HEAT}"
