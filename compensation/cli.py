@@ -19,7 +19,7 @@ app = lazy_app(
         "fit": Lazy(_FIT, "Fit the drift model to the frames of sessions of one camera."),
         "report": Lazy(_FIT, "Write the report of sessions of one camera: drift, model, and what it gains."),
         "datasheet": Lazy(
-            "thermostand.compensation.commands.datasheet_cli", "Write a camera's thermal datasheet, with uncertainties."
+            "thermostand.compensation.commands.fit_cli", "Write a camera's thermal datasheet, with uncertainties."
         ),
         "anchor": Lazy(_FIT, "Fit a model to where the target is in a new session."),
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
@@ -32,13 +32,13 @@ app = lazy_app(
             "Calibrate a camera from photographs of a board in any poses.",
         ),
         "calibrate-rig": Lazy(
-            "thermostand.compensation.commands.rig_cli",
+            "thermostand.compensation.commands.photographs_cli",
             "Calibrate cameras that are fixed to each other, from photographs.",
         ),
         "validate": Lazy(
             "thermostand.compensation.commands.validate_cli", "How far the target seems to move in space."
         ),
-        "budget": Lazy("thermostand.compensation.commands.budget_cli", "The stand's error budget, in um and px."),
+        "budget": Lazy("thermostand.compensation.commands.fit_cli", "The stand's error budget, in um and px."),
         "schema": Lazy(
             "thermostand.compensation.commands.schema_cli", "JSON Schemas of geometries and details, for editors."
         ),

@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from thermostand.compensation import drift_runtime
-from thermostand.compensation.drift.between_nights import BetweenNights
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.paper_model import PaperModel
-from thermostand.compensation.drift.polynomial import exponents
-from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.paper_model import PaperModel, exponents
+from thermostand.compensation.drift.thermal_model import BetweenNights, ThermalModel
 from thermostand.compensation.history.states import Float
 from thermostand.foundation.files import make_folder, write_whole
 

@@ -3,26 +3,285 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import NDArray
 
-from thermostand.compensation.budget.correction import (
-    granite_mm,
-    indices,
-    post_mm,
-    refraction_px,
-    target_strain,
-    varied,
-)
-from thermostand.compensation.budget.geometry import Geometry, StandTemperatures
-from thermostand.compensation.budget.refraction import Index, ciddor_1996, edlen_1966, tilted_shift_mm
-from thermostand.compensation.budget.repeatability import Repeatability, home_residuals, v0_repeats
-from thermostand.compensation.budget.session_temperatures import capture_states, mean_state, states_at
+from thermostand.compensation.budget.geometry import Geometry, Quantity, StandTemperatures
+from thermostand.compensation.one_camera import channel_of
 from thermostand.foundation.errors import SessionError
+from thermostand.foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE
+from thermostand.foundation.items import Event, StepState
+from thermostand.markers.detection import Detection, DetectionError, detect
 from thermostand.markers.target import Target
+from thermostand.recording.reading.interpolation import interpolated
 from thermostand.recording.reading.session import Session
+
+_SENSORS = tuple(name.removesuffix("_degC") for name in StandTemperatures.__dataclass_fields__)
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureState:
+    """A capture step of the session and the stand in the middle of it. role: reference, fit, pose ..., or empty."""
+
+    step_id: str
+    role: str
+    chamber_degC: float
+    start_ns: int
+    end_ns: int
+    state: StandTemperatures
+
+
+def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[StandTemperatures]:
+    """The thermometers at each instant; NaN where one was BAD or silent for more than two minutes.
+
+    SessionError when the session has no such thermometer.
+    """
+    columns = [interpolated(*session.readings(f"thermometers.{sensor}"), times_ns) for sensor in _SENSORS]
+    return [StandTemperatures(*map(float, row)) for row in np.stack(columns, axis=1)]
+
+
+def mean_state(states: Sequence[StandTemperatures]) -> StandTemperatures:
+    """The mean of each thermometer over the states that know it; NaN when none does."""
+    table = np.array([[getattr(state, f"{sensor}_degC") for sensor in _SENSORS] for state in states])
+    known = np.isfinite(table)
+    counts = np.maximum(known.sum(axis=0), 1)
+    means = np.where(known.any(axis=0), np.where(known, table, 0.0).sum(axis=0) / counts, math.nan)
+    return StandTemperatures(*map(float, means))
+
+
+def capture_states(session: Session) -> list[CaptureState]:
+    """Every capture that was completed, in order; SessionError when there is none."""
+    started = {mark.step_id: mark for mark in session.steps() if mark.kind == "capture" and mark.state == "started"}
+    ended = {mark.step_id: mark.time_ns for mark in session.steps() if mark.state == StepState.DONE}
+    marks = [mark for mark in started.values() if mark.step_id in ended]
+    if not marks:
+        raise SessionError(f"{session.path}: no capture was completed, so there is no state of the stand to judge")
+    middles = np.array([(mark.time_ns + ended[mark.step_id]) // 2 for mark in marks], np.int64)
+    found: list[CaptureState] = []
+    for mark, state in zip(marks, states_at(session, middles), strict=True):
+        chamber = mark.parameters.get("chamber_degC")
+        chamber_degC = float(chamber) if isinstance(chamber, int | float) else math.nan
+        role = str(mark.parameters.get("role") or "")
+        found.append(CaptureState(mark.step_id, role, chamber_degC, mark.time_ns, ended[mark.step_id], state))
+    return found
+
+
+KELVIN = 273.15
+_PA_PER_TORR = 133.322
+_GAS_J_per_mol_K = 8.314472
+
+Index = Callable[[float, float, float, float], float]
+"""(temperature_degC, pressure_Pa, vapour_Pa, wavelength_um) -> n - 1."""
+
+
+def saturation_Pa(temperature_degC: float) -> float:
+    """Saturation vapour pressure over water (IAPWS-IF97, as NIST uses it), supercooled below 0 degC."""
+    T = temperature_degC + KELVIN
+    k1, k2, k3, k4, k5 = 1.16705214528e3, -7.24213167032e5, -1.70738469401e1, 1.20208247025e4, -3.23255503223e6
+    k6, k7, k8, k9, k10 = 1.49151086135e1, -4.82326573616e3, 4.05113405421e5, -2.38555575678e-1, 6.50175348448e2
+    omega = T + k9 / (T - k10)
+    a = omega**2 + k1 * omega + k2
+    b = k3 * omega**2 + k4 * omega + k5
+    c = k6 * omega**2 + k7 * omega + k8
+    return 1e6 * (2 * c / (-b + math.sqrt(b * b - 4 * a * c))) ** 4
+
+
+def edlen_1966(temperature_degC: float, pressure_Pa: float, vapour_Pa: float, wavelength_um: float) -> float:
+    """n - 1 by B. Edlen, The refractive index of air, Metrologia 2 (1966) 71."""
+    S = wavelength_um**-2
+    standard = (8342.13 + 2406030 / (130 - S) + 15997 / (38.9 - S)) * 1e-8
+    p, pv = pressure_Pa / _PA_PER_TORR, vapour_Pa / _PA_PER_TORR
+    density = p * (1 + p * (0.817 - 0.0133 * temperature_degC) * 1e-6) / (720.775 * (1 + 0.0036610 * temperature_degC))
+    return standard * density - pv * (5.722 - 0.0457 * S) * 1e-8
+
+
+def ciddor_1996(
+    temperature_degC: float, pressure_Pa: float, vapour_Pa: float, wavelength_um: float, co2_ppm: float = 450.0
+) -> float:
+    """n - 1 by P. E. Ciddor, Refractive index of air: new equations for the visible, Appl. Opt. 35 (1996) 1566."""
+    S = wavelength_um**-2
+    axs = 1e-8 * (5792105 / (238.0185 - S) + 167917 / (57.362 - S)) * (1 + 5.34e-7 * (co2_ppm - 450))
+    vs = 1.022e-8 * (295.235 + 2.6422 * S - 0.032380 * S**2 + 0.004028 * S**3)
+    enhancement = 1.00062 + 3.14e-8 * pressure_Pa + 5.6e-7 * temperature_degC**2
+    xv = enhancement * vapour_Pa / pressure_Pa
+    molar = _molar_density(temperature_degC, pressure_Pa, xv)
+    # The molar masses of dry air and water cancel: densities count relative to those of the standard conditions.
+    air = molar * (1 - xv) / _molar_density(15.0, 101325.0, 0.0)
+    water = molar * xv / _molar_density(20.0, 1333.0, 1.0)
+    return air * axs + water * vs
+
+
+def _molar_density(t: float, p: float, xv: float) -> float:
+    """mol/m^3 of moist air, xv its mole fraction of water: BIPM 1981/91 compressibility (Ciddor, equation 12)."""
+    T = t + KELVIN
+    dry = 1.58123e-6 - 2.9331e-8 * t + 1.1043e-10 * t**2
+    moist = (5.707e-6 - 2.051e-8 * t) * xv + (1.9898e-4 - 2.376e-6 * t) * xv**2
+    compressibility = 1 - p / T * (dry + moist) + (p / T) ** 2 * (1.83e-11 - 0.765e-8 * xv**2)
+    return p / (compressibility * _GAS_J_per_mol_K * T)
+
+
+Float = NDArray[np.float64]
+
+
+def shift_mm(radius_mm: Float | float, distance_mm: float, interface_mm: float, n1: float, n2: float) -> Float:
+    """How much further out the ray arrives, mm, for radii of any shape; negative when n1 < n2 (warm camera)."""
+    tangent = np.asarray(radius_mm, dtype=np.float64) / distance_mm
+    sine = n1 / n2 * tangent / np.sqrt(1 + tangent**2)
+    return (distance_mm - interface_mm) * (sine / np.sqrt(1 - sine**2) - tangent)
+
+
+def tilted_shift_mm(tilt_rad: float, distance_mm: float, interface_mm: float, n1: float, n2: float) -> float:
+    """The common shift of the whole image by an interface that is turned by tilt_rad: what it does to the axis."""
+    return (distance_mm - interface_mm) * float(np.tan(tilt_rad - np.arcsin(n1 / n2 * np.sin(tilt_rad))))
+
+
+def appears_px(
+    offset_px: Float, focal_px: float, distance_mm: float, interface_mm: float, n1: float, n2: float
+) -> Float:
+    """How far an image point (..., 2), px from the principal point, is moved: outwards when the camera's air is warm.
+
+    The ray that reaches the target's point left at a smaller radius by `shift_mm`, to first order in it.
+    """
+    radius_px = np.linalg.norm(offset_px, axis=-1, keepdims=True)
+    radius_mm = radius_px / focal_px * distance_mm
+    moved_px = -shift_mm(radius_mm, distance_mm, interface_mm, n1, n2) / distance_mm * focal_px
+    return offset_px * moved_px / np.where(radius_px > 0, radius_px, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Repeatability:
+    """Root mean square of `count` returns, in `unit`; NaN when there was none."""
+
+    rms: float
+    unit: str
+    count: int
+
+
+def home_residuals(events: Sequence[Event], unit: str) -> Repeatability:
+    """Where the axes that move in `unit` (mm or deg) found their homes, against where they expected them."""
+    recorded = [
+        event.data
+        for event in events
+        if event.kind in (HOME_RESIDUAL, HOME_RESIDUAL_LARGE) and event.data.get("unit") == unit
+    ]
+    found = [float(residual) for data in recorded if isinstance(residual := data.get("residual"), int | float)]
+    return Repeatability(_rms(np.array(found)), unit, len(found))
+
+
+def v0_repeats(session: Session, target: Target) -> Repeatability:
+    """How far the image of V0 is from where it was, when the table returns to it at the end of a temperature, px.
+
+    Per coordinate, over all markers and temperatures; frames of a capture are averaged. The camera's drift in
+    these minutes is included: an upper limit.
+    """
+    pairs = _first_and_last_of_v0(capture_states(session))
+    wanted = {capture.step_id for pair in pairs for capture in pair}
+    centres = _mean_centres(session, target, wanted) if wanted else {}
+    moved = [
+        centres[again.step_id] - centres[first.step_id]
+        for first, again in pairs
+        if again.step_id in centres and first.step_id in centres
+    ]
+    return Repeatability(_rms(np.array(moved)), "px", len(moved))
+
+
+def _first_and_last_of_v0(captures: Sequence[CaptureState]) -> list[tuple[CaptureState, CaptureState]]:
+    """The first pose after the last repeat is V0 (experiments/validation.py), and the next repeat is V0 again."""
+    pairs: list[tuple[CaptureState, CaptureState]] = []
+    first: CaptureState | None = None
+    for capture in captures:
+        if capture.role == "pose" and first is None:
+            first = capture
+        elif capture.role == "repeatability" and first is not None:
+            pairs.append((first, capture))
+            first = None
+    return pairs
+
+
+def _mean_centres(session: Session, target: Target, wanted: set[str]) -> dict[str, NDArray[np.float64]]:
+    """Step -> mean centres (N, 2) of its frames, NaN for markers that one of them lacks."""
+    seen: dict[str, list[NDArray[np.float64]]] = {}
+    previous: Detection | None = None
+    own = channel_of(session)
+    for frame in session.frames():
+        if frame.step_id not in wanted or frame.channel != own:
+            continue
+        try:
+            previous = detect(frame.image, target, previous)
+        except DetectionError:
+            continue
+        good = (previous.flags == 0)[:, None]
+        seen.setdefault(frame.step_id, []).append(np.where(good, previous.centres_px, np.nan))
+    return {step_id: np.mean(frames, axis=0) for step_id, frames in seen.items()}
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+
+
+def displacement_px(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry, xy_px: Float) -> Float:
+    """The displacement of image points (..., 2) by granite, post, target and air, from `reference` to `state`."""
+    centre = (np.array(geometry.image_px) - 1) / 2
+    offset = np.asarray(xy_px, dtype=np.float64) - centre
+    scale = (
+        target_strain(state, reference, geometry) - granite_mm(state, reference, geometry) / geometry.distance_mm.value
+    )
+    post = post_mm(state, reference, geometry) * geometry.focal_px / geometry.distance_mm.value
+    roll = math.radians(geometry.camera_roll_deg)
+    down = np.array([math.sin(roll), math.cos(roll)])
+    refraction = refraction_px(state, geometry, offset) - refraction_px(reference, geometry, offset)
+    return scale * offset + post * down + refraction
+
+
+def varied(state: StandTemperatures, geometry: Geometry) -> Iterator[tuple[StandTemperatures, Geometry]]:
+    """State and geometry with one uncertain input after the other larger by its standard uncertainty."""
+    for name in Geometry.model_fields:
+        quantity = getattr(geometry, name)
+        if isinstance(quantity, Quantity) and quantity.u > 0:
+            larger = Quantity(value=quantity.value + quantity.u, u=quantity.u)
+            yield state, geometry.model_copy(update={name: larger})
+    for field in fields(StandTemperatures):
+        on_granite = geometry.granite_gradient_K if field.name.startswith("granite") else 0.0
+        yield state.warmer_by(**{field.name: math.hypot(geometry.thermometer_K, on_granite)}), geometry
+
+
+def granite_mm(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
+    """How much the base has moved the target away from the camera."""
+    inside_K = state.granite_inside_degC - reference.granite_inside_degC
+    outside_K = state.granite_outside_degC - reference.granite_outside_degC
+    lengths_mm_K = geometry.granite_inside_mm.value * inside_K + geometry.granite_outside_mm.value * outside_K
+    return geometry.granite_per_K.value * lengths_mm_K
+
+
+def post_mm(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
+    """How much the post has lifted the camera."""
+    inside_K = state.granite_inside_degC - reference.granite_inside_degC
+    return geometry.granite_per_K.value * geometry.post_mm.value * inside_K
+
+
+def target_strain(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
+    """Relative growth of the target."""
+    return geometry.target_per_K.value * (state.artifact_degC - reference.artifact_degC)
+
+
+def refraction_px(state: StandTemperatures, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
+    """How far points (..., 2), px from the principal point, appear outwards by the air's indices on both sides."""
+    n1, n2 = indices(state, geometry, index)
+    return appears_px(offset_px, geometry.focal_px, geometry.distance_mm.value, geometry.interface_mm.value, n1, n2)
+
+
+def indices(state: StandTemperatures, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
+    """Refractive indices of the air at the camera and of the laboratory's."""
+    pressure_Pa = geometry.pressure_Pa.value
+    laboratory_Pa = geometry.relative_humidity.value * saturation_Pa(state.laboratory_degC)
+    chamber_Pa = min(laboratory_Pa, saturation_Pa(state.air_degC))
+    n1 = 1 + index(state.air_degC, pressure_Pa, chamber_Pa, geometry.wavelength_um)
+    return n1, 1 + index(state.laboratory_degC, pressure_Pa, laboratory_Pa, geometry.wavelength_um)
+
 
 Effect = Callable[[StandTemperatures, Geometry], tuple[float, float]]
 """(state, geometry) -> (um on or of the target, px in the image)."""

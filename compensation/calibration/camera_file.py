@@ -18,8 +18,8 @@ from thermostand.compensation.calibration.calibrate import Calibration
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.pinhole import NAMES, Pinhole
 from thermostand.compensation.calibration.rays import RayLens, exponents
-from thermostand.compensation.calibration.seen_area import NOT_SEEN
 from thermostand.compensation.calibration.stage_geometry import ERRORS, PARAMETERS
+from thermostand.compensation.calibration.uncertainty import NOT_SEEN
 from thermostand.compensation.drift.hull import is_area
 from thermostand.compensation.sound_values import (
     Hull,

@@ -11,9 +11,67 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thermostand.compensation.calibration.least_squares import Float
+from thermostand.foundation.errors import CalibrationError
+
+
+def crosses(vectors: Float) -> Float:
+    """Matrices (..., 3, 3) that multiply by `vectors` x from the left."""
+    matrices = np.zeros((*vectors.shape, 3))
+    for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
+        matrices[..., row, column] = vectors[..., axis]
+        matrices[..., column, row] = -vectors[..., axis]
+    return matrices
+
+
+def across(axis: Float) -> Float:
+    """(3, 2): unit vectors at right angles to a unit vector (3,) and each other, steady when it turns a little."""
+    coordinate = np.eye(3)[np.argmin(np.abs(axis))]
+    first = coordinate - axis * (axis @ coordinate)
+    first = first / np.linalg.norm(first)
+    return np.column_stack([first, crosses(axis) @ first])
+
+
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpencvCalibration:
+    """lens, and the pose of each view: rotations (P, 3, 3) and translations (P, 3), mm. rms_px: over both coordinates,
+    sqrt(mean(dx^2 + dy^2)), as OpenCV counts."""
+
+    lens: Pinhole
+    rotations: Float
+    translations_mm: Float
+    rms_px: float
+
+
+def calibrate_opencv(centres_px: Float, points_mm: Float, image_size: tuple[int, int]) -> OpencvCalibration:
+    """Calibrate from centres (P, N, 2), NaN where missing, of board points (N, 3), of which Z is taken as 0.
+
+    CalibrationError when OpenCV finds no camera.
+    """
+    plane = np.column_stack([points_mm[:, :2], np.zeros(len(points_mm))])
+    seen = np.isfinite(centres_px[:, :, 0])
+    objects = [plane[view].astype(np.float32) for view in seen]
+    images = [centres[view].astype(np.float32) for centres, view in zip(centres_px, seen, strict=True)]
+    try:
+        rms, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+            objects, images, image_size, np.eye(3), np.zeros(5), criteria=_CRITERIA
+        )
+    except cv2.error as error:
+        raise CalibrationError(f"OpenCV finds no camera for these {len(images)} views ({error.err})") from error
+    if not np.isfinite(rms):
+        raise CalibrationError("OpenCV finds no camera: its fit does not converge")
+    frame = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    lens = Pinhole(np.concatenate([frame, np.ravel(distortion)[:5]]), image_size)
+    rotations = Rotation.from_rotvec(np.array(turns, np.float64).reshape(-1, 3)).as_matrix()
+    return OpencvCalibration(lens, rotations, np.array(shifts, np.float64).reshape(-1, 3), float(rms))
+
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """The order of a camera's vector: that of OpenCV and mrcal."""

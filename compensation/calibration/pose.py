@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.centre_corrections import shifts_by_camera
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise, whiteners
-from thermostand.compensation.calibration.rotation import crosses
+from thermostand.compensation.calibration.pinhole import crosses
 from thermostand.foundation.errors import CalibrationError
 
 _LEAST_MARKERS = 4

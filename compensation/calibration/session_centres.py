@@ -7,22 +7,107 @@ axes reported at rest between the moves before and after, else where they were s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.calibration.averages import MeanCentres, mean_centres, scatter_chi
 from thermostand.compensation.calibration.least_squares import Float
-from thermostand.compensation.calibration.visits import AXES, place, visits_for
 from thermostand.compensation.one_camera import channel_of
 from thermostand.foundation.errors import CalibrationError, SessionError
+from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.progress import Report
 from thermostand.markers.detection import Detection, DetectionError, detect
 from thermostand.markers.target import Target
 from thermostand.recording.format.decoded_items import frame_of
 from thermostand.recording.reading.session import Session
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeanCentres:
+    """centres_px (N, 2): weighted means, NaN for a marker that no frame has. covariance_px2 (N, 2, 2): of the means, as
+    the frames' covariances predict. squares: whitened scatter of the frames about the means, degrees: its degrees of
+    freedom."""
+
+    centres_px: Float
+    covariance_px2: Float
+    squares: float
+    degrees: int
+
+
+def mean_centres(centres_px: Float, covariance_px2: Float) -> MeanCentres:
+    """Of frames' centres (F, N, 2) and covariances (F, N, 2, 2); NaN where a frame lacks a marker."""
+    good = np.isfinite(centres_px[:, :, 0])
+    information = np.zeros_like(covariance_px2)
+    information[good] = np.linalg.inv(covariance_px2[good])
+    total = information.sum(axis=0)
+    seen = good.any(axis=0)
+    covariance = np.full(total.shape, np.nan)
+    covariance[seen] = np.linalg.inv(total[seen])
+    weighted = np.einsum("fnij,fnj->ni", information, np.where(good[:, :, None], centres_px, 0.0))
+    mean = np.einsum("nij,nj->ni", covariance, weighted)
+    off = np.where(good[:, :, None], centres_px - mean, 0.0)
+    squares = float(np.einsum("fni,fnij,fnj->", off, information, off))
+    return MeanCentres(mean, covariance, squares, 2 * int(good.sum() - seen.sum()))
+
+
+def scatter_chi(means: list[MeanCentres]) -> float:
+    """Scatter of the frames about their means over the scatter predicted; NaN when there is one frame each."""
+    degrees = sum(mean.degrees for mean in means)
+    return float(np.sqrt(sum(mean.squares for mean in means) / degrees)) if degrees else float("nan")
+
+
+Axis = Literal["linear", "rotary"]
+AXES: tuple[Axis, Axis] = ("linear", "rotary")
+_END_NS = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A capture: where the axes (linear mm, rotary deg) were sent, when they came to rest and when they moved on."""
+
+    role: str
+    sent: dict[str, float]
+    since_ns: dict[str, int]
+    until_ns: dict[str, int]
+
+
+def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, Visit]:
+    """Step id -> visit of the captures with one of these roles, in order; SessionError when an axis was not moved
+    before one."""
+    sent: dict[str, float] = {}
+    since_ns: dict[str, int] = {}
+    visits: dict[str, Visit] = {}
+    for mark in steps:
+        if mark.kind == "move_to":
+            axis = str(mark.parameters.get("axis"))
+            if mark.state is StepState.STARTED:
+                for visit in visits.values():
+                    visit.until_ns.setdefault(axis, mark.time_ns)
+            elif mark.state is StepState.DONE:
+                sent[axis], since_ns[axis] = float(str(mark.parameters.get("position"))), mark.time_ns
+        elif mark.kind == "capture" and mark.parameters.get("role") in roles and mark.state is StepState.STARTED:
+            role = str(mark.parameters["role"])
+            if not all(axis in sent for axis in AXES):
+                raise SessionError(f"step {mark.index + 1}: a {role} capture, but no move of both axes before it")
+            visits[mark.step_id] = Visit(role, dict(sent), dict(since_ns), {})
+    return visits
+
+
+def place(session: Session, axis: Axis, visit: Visit) -> float:
+    """Mean of what the axis reported at rest during the visit, else where it was sent; mm or deg."""
+    try:
+        times_ns, values = session.readings(f"{axis}.position")
+        moving_ns, moving = session.readings(f"{axis}.moving")
+    except SessionError:
+        return visit.sent[axis]
+    resting = np.isin(times_ns, moving_ns[moving == 0])
+    here = resting & (times_ns >= visit.since_ns[axis]) & (times_ns <= visit.until_ns.get(axis, _END_NS))
+    reported = values[here & np.isfinite(values)]
+    return float(reported.mean()) if len(reported) else visit.sent[axis]
+
 
 ROLE = "calibration"
 _LEAST_MARKERS = 12

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thermostand.compensation.calibration.least_squares import Float
-from thermostand.compensation.calibration.rotation import across, crosses
+from thermostand.compensation.calibration.pinhole import across, crosses
 
 PARAMETERS = 12
 """Of a table's step: c (3), l (2), a (2), R0 (3), o (2)."""

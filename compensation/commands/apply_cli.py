@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,23 +13,14 @@ import typer
 
 from thermostand.compensation.apply.c_header import export_c
 from thermostand.compensation.apply.compensate_images import Form, corrected_image, middle_flags, write_image
-from thermostand.compensation.apply.compensate_points import (
-    CAMERA,
-    X,
-    Y,
-    outside_text,
-    read_points,
-    times,
-    write_corrected,
-)
 from thermostand.compensation.apply.ros2_package import export_ros2
 from thermostand.compensation.apply.runtime_export import export
+from thermostand.compensation.arrays import Row, numbers, read_rows
 from thermostand.compensation.commands.options import CameraName, Incomplete, open_session
-from thermostand.compensation.csv_rows import numbers
-from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift.paper_model import PaperModel
-from thermostand.compensation.history.states import States
+from thermostand.compensation.history.states import Float, States
 from thermostand.compensation.history.thermal_history import recorded_history, states_at
 from thermostand.compensation.one_camera import name_of, own_frames, take, temperatures_at_frames
 from thermostand.experiments.steps import Role
@@ -41,6 +32,58 @@ from thermostand.foundation.output import say, show
 from thermostand.foundation.progress import progress
 from thermostand.markers.image_file import read_image
 from thermostand.recording.reading.session import Session
+
+X, Y, TIME, CAMERA = "x_px", "y_px", "time_ns", "camera_degC"
+ADDED = ("x_reference_px", "y_reference_px", "var_x_correction_px2", "cov_xy_correction_px2", "var_y_correction_px2",
+         "outside")  # fmt: skip
+
+
+def read_points(path: Path) -> list[dict[str, str]]:
+    """The rows of a table with columns x_px and y_px, such as `compensate detect` writes; SessionError when it has
+    none, or a row that does not fit."""
+    rows, columns = read_rows(path, (X, Y), f"it needs {X} and {Y}, as compensate detect writes them")
+    taken = [name for name in ADDED if name in columns]
+    if taken:
+        raise SessionError(f"{path}: has a column {taken[0]} already; these points have been corrected")
+    return rows
+
+
+def times(path: Path, rows: Sequence[Row]) -> list[int]:
+    """(M,): the instants, ns; ConfigError when a row has none."""
+    found: list[int] = []
+    for line, row in enumerate(rows, 2):
+        text = row.get(TIME, "").strip()
+        if not text.isdecimal():
+            raise ConfigError(f"{path}: line {line}: {TIME} is {text!r}; --session needs the instant of every point")
+        found.append(int(text))
+    return found
+
+
+def write_corrected(path: Path, rows: Sequence[Row], xy_px: Float, model: DriftModel, states: States) -> None:
+    """The table with columns added: the corrected place, the covariance of the correction, and why it is an
+    extrapolation (names of Outside joined by `|`, empty inside the calibrated range). nan where it is unknown.
+
+    The file appears when it is complete; SessionError when the place refuses.
+    """
+    corrected, covariance = model.correct(xy_px, states), model.covariance(xy_px, states)
+    flags = model.flags(xy_px, states)
+    with whole_file(path) as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*(rows[0] if rows else (X, Y)), *ADDED])
+        for index, row in enumerate(rows):
+            writer.writerow([*row.values(), *_added(corrected[index], covariance[index], int(flags[index]))])
+
+
+def _added(place_px: Float, covariance_px2: Float, flags: int) -> Iterator[str]:
+    yield from (f"{value:.6f}" for value in place_px)
+    yield from (f"{value:.6e}" for value in (covariance_px2[0, 0], covariance_px2[0, 1], covariance_px2[1, 1]))
+    yield outside_text(flags)
+
+
+def outside_text(flags: int) -> str:
+    """The names of the flags joined by `|`, empty when there is none."""
+    return "|".join(flag.name or "" for flag in Outside(flags))
+
 
 app = App()
 

@@ -1,17 +1,29 @@
-"""`compensate fit`, `anchor` and `report`: the drift of sessions of one camera."""
+"""`compensate fit`, `anchor`, `report`, `datasheet` and `budget`: what sessions of one camera say."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from thermostand.compensation.centres_table import observations_of_table
-from thermostand.compensation.commands.budget_cli import budgets_of_sessions
-from thermostand.compensation.commands.options import CameraName, DetailsOption, Finding, named_target
+from thermostand.compensation.arrays import observations_of_table
+from thermostand.compensation.budget.budget import Budget, budget
+from thermostand.compensation.budget.budget import table as budget_table
+from thermostand.compensation.budget.geometry import load_geometry
+from thermostand.compensation.commands.options import (
+    CameraName,
+    DetailsOption,
+    Finding,
+    Incomplete,
+    TargetOption,
+    named_target,
+    open_session,
+)
+from thermostand.compensation.datasheet.datasheet import datasheet
 from thermostand.compensation.datasheet.details import load_details
-from thermostand.compensation.drift.anchoring import anchored, thermal_of
+from thermostand.compensation.drift.anchoring import anchored, fit_like, thermal_of
 from thermostand.compensation.drift.bump import Bump
 from thermostand.compensation.drift.choosing import Form, check_request
 from thermostand.compensation.drift.choosing import fit as fit_model
@@ -20,12 +32,14 @@ from thermostand.compensation.drift.evaluation import Evaluation, evaluate, tabl
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.paper_model import MAX_DEGREE
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.drift.type_prior import fit_like
 from thermostand.compensation.drift.unrepeated import Cause, find_unrepeated
-from thermostand.compensation.observations import Observations
+from thermostand.compensation.observations import Observations, session_target
+from thermostand.compensation.one_camera import take
 from thermostand.compensation.reporting.drawing.drawing import drawing
 from thermostand.compensation.reporting.equipment import equipment_of
 from thermostand.compensation.reporting.numbers import Extras, table_positions
+from thermostand.compensation.reporting.page import pdf_of
+from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page
 from thermostand.compensation.reporting.report import (
     NoModel,
     can_be_scored,
@@ -37,11 +51,82 @@ from thermostand.compensation.reporting.report import (
 from thermostand.compensation.validation3d.document import load_validation
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.files import check_writable
+from thermostand.foundation.files import check_writable, write_whole, write_whole_bytes
 from thermostand.foundation.output import say, show
+from thermostand.markers.target import Target
 from thermostand.recording.reading.session import Session
 
 app = App()
+
+
+@app.command("budget")
+def budget_of_session(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded session.")],
+    geometry: Annotated[str, typer.Option(help="The stand's geometry: a file, or the installed `paper`.")] = "paper",
+    target: TargetOption = None,
+    camera: CameraName = None,
+    incomplete: Incomplete = False,
+) -> None:
+    """The stand's error budget: refraction, granite, target and table, in um and px, with uncertainty.
+
+    Example: compensate budget sessions/20260101T180000Z-validation --geometry my-stand.yaml
+    """
+    stand = load_geometry(geometry)
+    recorded = open_session(session, camera, incomplete)
+    found = budget(recorded, named_target(target) or session_target(recorded), stand)
+    show(found, [budget_table(found)])
+
+
+def budgets_of_sessions(
+    paths: Sequence[Path], camera: str | None, geometry: str, target: Target | None
+) -> dict[str, Budget]:
+    """The budget of each session, by its name. SessionError or ConfigError with a sentence."""
+    stand = load_geometry(geometry)
+    opened = [Session.open(path) for path in paths]
+    for session in opened:
+        take(session, camera)
+    return {
+        session.metadata.get("session_id", ""): budget(session, target or session_target(session), stand)
+        for session in opened
+    }
+
+
+_FORMATS = (".html", ".pdf", ".json")
+
+
+@app.command("datasheet")
+def write_datasheet(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions of one camera.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.html|pdf|json", help="The file to write.")],
+    model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
+    details: DetailsOption = None,
+    camera: CameraName = None,
+    *,
+    finding: Finding,
+) -> None:
+    """Write a camera's thermal datasheet: px/K and ppm/K, settling, hysteresis, what each form of compensation leaves,
+    each with its expanded uncertainty and the budget it comes from.
+
+    Example: compensate datasheet sessions/20260101T180000Z-thermal-cycle -o camera.pdf
+    """
+    if out.suffix.lower() not in _FORMATS:
+        raise ConfigError(f"{out}: give a name that ends in {', '.join(_FORMATS)}")
+    check_writable(out)
+    stated = load_details(details)
+    given = None if model is None else load_model(model)
+    observations = finding.observed(sessions, camera)
+    sheet = datasheet(observations, given or fit_model(observations), stated)
+    equipment = equipment_of(Session.open(sessions[0]))
+    if out.suffix.lower() == ".json":
+        write_whole(out, datasheet_json(sheet, equipment))
+    elif out.suffix.lower() == ".pdf":
+        write_whole_bytes(out, pdf_of(datasheet_page(sheet, equipment)))
+    else:
+        write_whole(out, datasheet_page(sheet, equipment))
+    known = sum(one.value == one.value for one in sheet.quantities)
+    line = f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)"
+    show({"file": out, "quantities": sheet.quantities}, [line])
+
 
 Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of recorded sessions.")]
 DegreeOption = Annotated[

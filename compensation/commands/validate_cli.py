@@ -15,11 +15,16 @@ from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.observations import Float
 from thermostand.compensation.one_camera import name_of
 from thermostand.compensation.reporting.pages import validation_page
-from thermostand.compensation.validation3d.document import as_json
-from thermostand.compensation.validation3d.stand_part import StandPart, stand_part
-from thermostand.compensation.validation3d.validate import LensModel, camera_of, check_same, validate
+from thermostand.compensation.validation3d.document import as_json, summary
+from thermostand.compensation.validation3d.validate import (
+    LensModel,
+    StandPart,
+    camera_of,
+    check_same,
+    stand_part,
+    validate,
+)
 from thermostand.compensation.validation3d.validation_frames import validation_frames
-from thermostand.compensation.validation3d.validation_text import summary
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.files import check_writable, write_whole

@@ -2,24 +2,338 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermostand.compensation.datasheet.coefficients import coefficients, curve
 from thermostand.compensation.datasheet.details import Details
-from thermostand.compensation.datasheet.left_over import hysteresis_quantities, residual_quantities
-from thermostand.compensation.datasheet.motions import MOTIONS, Visits, Warming, motions, visits_of, warming_of
-from thermostand.compensation.datasheet.quantity import Quantity, pooled
-from thermostand.compensation.datasheet.warming import warming_quantities
+from thermostand.compensation.datasheet.motions import MOTIONS, UNITS, Visits, Warming, motions, visits_of, warming_of
+from thermostand.compensation.datasheet.quantity import Contribution, Quantity, direct, pooled
 from thermostand.compensation.drift.bumps import around_bumps
 from thermostand.compensation.drift.choosing import FORMS
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
-from thermostand.compensation.drift.hysteresis import hysteresis
-from thermostand.compensation.observations import Observations
+from thermostand.compensation.drift.hysteresis import Hysteresis, hysteresis
+from thermostand.compensation.observations import Float, Observations
 from thermostand.foundation.errors import SessionError
+
+_FEWEST = 3
+
+
+def hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float]) -> list[Quantity]:
+    """RMS of heating minus cooling over set-points reached from both sides, mpx. scatter_px: what does not repeat."""
+    model = "root mean square of (heating − cooling) over set-points reached from both sides, mean over the markers"
+    quantities: list[Quantity] = []
+    for axis, name in enumerate("IJ"):
+        key, title = f"hysteresis_{name}", f"Heating against cooling, {name}"
+        gaps = [] if found is None else found.gaps
+        differences = 1e3 * np.array([gap.difference_px[axis] for gap in gaps])
+        one = Quantity(key, "Dependence on the way", title, "mpx", math.nan, model)
+        if len(differences) < _FEWEST:
+            why = "fewer than three set-points were reached from both sides"
+            quantities.append(Quantity(key, one.group, title, "mpx", math.nan, model, (), why))
+            continue
+        noise = 1e3 * float(np.sqrt(np.mean([gap.uncertainty_px[axis] ** 2 for gap in gaps])))
+        repeats = 1e3 * scatter_px[axis] * math.sqrt(2 / len(differences))
+        lines = (
+            direct("choice of set-points", "A", _jackknife(differences, _rms), "mpx", "each left out once"),
+            direct("noise of the markers", "A", noise / math.sqrt(len(differences)), "mpx", "as the marker fit claims"),
+            direct("what does not repeat", "A", repeats, "mpx", UNREPEATED),
+        )
+        quantities.append(Quantity(key, one.group, title, "mpx", _rms(differences), model, lines))
+    return quantities
+
+
+def residual_quantities(form: str, evaluation: Evaluation | None, scatter_px: Sequence[float]) -> list[Quantity]:
+    """RMS along I and J at held-out set-points, mpx; the marker's noise of single frames is in it."""
+    model = (
+        "root mean square of (reference − corrected) over all centres at held-out set-points, with their noise in it"
+    )
+    group = "Left after compensation"
+    quantities: list[Quantity] = []
+    for axis, name in enumerate("IJ"):
+        key, title = f"left_{form}_{name}", f"The {form} form, {name}: RMS at held-out set-points"
+        if evaluation is None or len(evaluation.temperatures) < _FEWEST:
+            why = "the sessions do not support this form, or have fewer than three set-points to score it"
+            quantities.append(Quantity(key, group, title, "mpx", math.nan, model, (), why))
+            continue
+        each = 1e3 * np.array([row.after_px[axis] for row in evaluation.temperatures])
+        value = 1e3 * evaluation.rms_after_px[axis]
+        # What does not repeat adds to the residual as a square: it matters less the larger that is.
+        repeats = math.sqrt(value**2 + (1e3 * scatter_px[axis]) ** 2 / len(each)) - value
+        lines = (
+            direct("choice of set-points", "A", _jackknife(each, _rms), "mpx", "each left out once"),
+            direct("what does not repeat", "A", repeats, "mpx", UNREPEATED),
+        )
+        quantities.append(Quantity(key, group, title, "mpx", value, model, lines))
+    return quantities
+
+
+def _rms(values: Float) -> float:
+    return math.sqrt(float(np.mean(values**2)))
+
+
+def _jackknife(values: Float, statistic: Callable[[Float], float]) -> float:
+    """Standard uncertainty of a statistic of independent values."""
+    count = len(values)
+    without = np.array([statistic(np.delete(values, k)) for k in range(count)])
+    return math.sqrt((count - 1) / count * float(((without - without.mean()) ** 2).sum()))
+
+
+NAMES = ("Shift of the image, I (right)", "Shift of the image, J (down)", "Scale of the image", "Turn of the image")
+_GROUP = "Temperature coefficients"
+_FEWEST_VISITS = 8
+_MOST_CORRELATION = 0.9
+_MODEL = (
+    "c of y = a + c (T − T0) + b (T − T0)² ± [d + f (T − T0)], + heating, − cooling, by least squares over all visits; "
+    "T: air near the camera, T0: at the reference"
+)
+_TOO_FEW = "fewer than eight visits of four set-points with a known air temperature"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """slope: at the reference, the mean of both branches. u_slope: of what the visits scatter about the curve, with the
+    correlation of neighbours. branches: how much the heating branch's slope is above it, 0 when there is one branch
+    only. scatter: standard deviation of a visit about the curve. span_K: of the air."""
+
+    slope: float
+    u_slope: float
+    branches: float
+    scatter: float
+    span_K: float
+
+
+def curve(visits: Visits, motion: int) -> Curve | None:
+    """None when there are too few visits to say how they scatter."""
+    count = len(visits.air_degC)
+    if count < _FEWEST_VISITS or len(np.unique(visits.chamber_degC)) < 4:
+        return None
+    away_K = visits.air_degC - visits.air_degC[0]
+    side = np.sign(np.diff(visits.chamber_degC, prepend=visits.chamber_degC[0]))
+    terms = np.stack([np.ones(count), away_K, away_K**2], axis=1)
+    both = (side > 0).sum() > 1 and (side < 0).sum() > 1
+    if both:
+        terms = np.column_stack([terms, side, side * away_K])
+    found, _, rank, _ = np.linalg.lstsq(terms, visits.moved[:, motion], rcond=None)
+    if rank < terms.shape[1]:
+        return None
+    left = visits.moved[:, motion] - terms @ found
+    scatter = math.sqrt(float(left @ left) / (count - rank))
+    # What comes slowly makes neighbours alike: fewer visits are independent than there are.
+    alike = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-30)
+    alike = min(max(alike, 0.0), _MOST_CORRELATION)
+    u_slope = scatter * math.sqrt(float(np.linalg.inv(terms.T @ terms)[1, 1]) * (1 + alike) / (1 - alike))
+    return Curve(float(found[1]), u_slope, float(found[4]) if both else 0.0, scatter, float(np.ptp(visits.air_degC)))
+
+
+def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> list[Quantity]:
+    """Of the four motions."""
+    found: list[Quantity] = []
+    for motion, (key, name, unit) in enumerate(zip(MOTIONS, NAMES, UNITS, strict=True)):
+        fitted = curve(visits, motion)
+        one = Quantity(f"{key}_per_K", _GROUP, name, f"{unit}/K", math.nan, _MODEL, why=_TOO_FEW)
+        if fitted is None:
+            found.append(one)
+            continue
+        lines = [
+            Contribution("scatter of the visits about the curve", "A", fitted.u_slope, f"{unit}/K", 1.0,
+                         "least squares, with the correlation of neighbouring visits"),
+            Contribution("slope of heating against cooling", "B", abs(fitted.branches) / math.sqrt(3), f"{unit}/K", 1.0,
+                         "rectangular, between the slopes of the two branches"),
+            Contribution("span of the air's temperature", "B", math.sqrt(2) * u_air_K, "K",
+                         fitted.slope / fitted.span_K, "thermometer and its place, both ends of the range"),
+        ]  # fmt: skip
+        if key == "scale":
+            lines.append(
+                Contribution("expansion of the target", "B", target_ppm_per_K, "ppm/K", 1.0,
+                             "the part of the air's change that may reach the target")
+            )  # fmt: skip
+        found.append(replace(one, value=fitted.slope, contributions=tuple(lines), why=""))
+    return found
+
+
+UNREPEATED = "what the chosen form leaves unexplained"
+_SWITCHING_ON = "Switching on"
+_NAMES = ("Drift in the warm-up, I", "Drift in the warm-up, J", "Change of scale in the warm-up")
+_SETTLED = 0.9
+_LAST_S = 300.0
+_MOST_EXPONENTIALS = 10
+_NO_WARM_UP = "no warm-up was recorded at the reference's place"
+_OF_RESIDUALS = "residuals of a line and exponentials"
+_NO_CURVE = "no temperature coefficient to compare with"
+
+
+def warming_quantities(
+    warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float
+) -> list[Quantity]:
+    """All of them; NaN with a reason where nothing was recorded. scatter: of MOTIONS, what does not repeat."""
+    share = _share(warming, visits, scatter, u_air_K)
+    return [
+        *_drifts(warming, scatter, u_air_K),
+        _settling(warming, scatter),
+        _rate(warming, scatter),
+        _self_heating(visits, u_air_K),
+        share,
+        _rest(share),
+    ]
+
+
+def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -> list[Quantity]:
+    found: list[Quantity] = []
+    for motion, name in enumerate(_NAMES):
+        key, unit = f"warm_up_{MOTIONS[motion]}", UNITS[motion]
+        if warming is None:
+            found.append(Quantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP))
+            continue
+        value = float(warming.moved[-1, motion])
+        minutes = warming.since_s[[0, -1]] / 60
+        risen_K = max(float(warming.camera_degC[-1] - warming.camera_degC[0]), 1.0)
+        model = f"y at {minutes[1]:z.1f} min minus y at {minutes[0]:z.1f} min"
+        model += " after switching on" if warming.known else " of the recording"
+        lines = (
+            direct("what does not repeat", "A", math.sqrt(2) * scatter[motion], unit, UNREPEATED),
+            direct("noise of the frames", "A", math.sqrt(2) * frame_noise(warming.since_s, warming.moved[:, motion]),
+                   unit, _OF_RESIDUALS),
+            Contribution("temperature it began at", "B", u_air_K, "K", value / risen_K, "thermometer and its place"),
+        )  # fmt: skip
+        found.append(Quantity(key, _SWITCHING_ON, name, unit, value, model, lines))
+    return found
+
+
+def frame_noise(since_s: Float, values: Float) -> float:
+    """Standard deviation of one frame about the drift: of the residuals of a line and exponentials, by least squares.
+
+    since_s, values (F,), F >= 5. A warm-up is a sum of exponentials, so that no drift is left in the residuals,
+    whatever the interval between frames; second differences take its curvature for noise. Of noiseless drifts of 0.3 px
+    with one or two time constants of 90 to 1900 s, 5 to 240 s between frames, this leaves at most 0.0002 px; of less
+    than ten frames up to 0.01 px, for then there are too few for two exponentials.
+    """
+    at_s = since_s - since_s[0]
+    count, span_s = len(at_s), float(at_s[-1])
+    # Time constants from half an interval to the whole warm-up; half of the frames are left for the residuals.
+    shortest_s = span_s / (count - 1) / 2
+    constants_s = np.geomspace(shortest_s, span_s, min(_MOST_EXPONENTIALS, max(1, (count - 4) // 2)))
+    terms = np.column_stack([np.ones(count), at_s / span_s, np.exp(-at_s[:, None] / constants_s)])
+    terms /= np.linalg.norm(terms, axis=0)
+    found, _, rank, _ = np.linalg.lstsq(terms, values, rcond=1e-12)
+    left = values - terms @ found
+    return math.sqrt(float(left @ left) / (count - int(rank)))
+
+
+def _settling(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
+    key, name = "settling_s", "Time to 90 % of the drift in the recorded warm-up"
+    if warming is None:
+        return Quantity(key, _SWITCHING_ON, name, "s", math.nan, "", (), _NO_WARM_UP)
+    whole = warming.moved[-1, :2]
+    size = float(np.linalg.norm(whole))
+    along = warming.moved[:, :2] @ whole / max(size, 1e-12)
+    model = f"first time after which the drift along its direction stays above {_SETTLED:.0%} of its last value"
+    noise = math.sqrt(2) * frame_noise(warming.since_s, along)
+    if size < 10 * noise:
+        return Quantity(
+            key, _SWITCHING_ON, name, "s", math.nan, model, (), "the warm-up moves the image by no more than noise"
+        )
+    below = int(np.flatnonzero(along < _SETTLED * size)[-1])
+    after = min(below + 1, len(along) - 1)
+    step_s, step_px = warming.since_s[after] - warming.since_s[below], along[after] - along[below]
+    value = float(warming.since_s[below] + step_s * (_SETTLED * size - along[below]) / max(float(step_px), 1e-12))
+    rate = max(_slope(warming.since_s, along, value), 1e-9)
+    lines = (
+        Contribution("drift at that time", "A", noise, "px", 1 / rate, _OF_RESIDUALS),
+        Contribution("what does not repeat", "A", float(np.hypot(scatter[0], scatter[1])), "px", 1 / rate,
+                     UNREPEATED),
+        direct("instant of switching on", "B", 0.5, "s", "a second between commands and readings"),
+    )  # fmt: skip
+    return Quantity(key, _SWITCHING_ON, name, "s", value, model, lines)
+
+
+def _slope(at_s: Float, values: Float, middle_s: float) -> float:
+    near = np.abs(at_s - middle_s) <= _LAST_S
+    if near.sum() < 3:
+        return 0.0
+    return abs(float(np.polyfit(at_s[near] - middle_s, values[near], 1)[0]))
+
+
+def _rate(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
+    key, name, unit = "rate_at_end", "Drift still going on at the end of the warm-up", "mpx/min"
+    if warming is None:
+        return Quantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP)
+    last = warming.since_s >= warming.since_s[-1] - _LAST_S
+    if last.sum() < 4:
+        return Quantity(
+            key, _SWITCHING_ON, name, unit, math.nan, "", (), "fewer than four frames in its last five minutes"
+        )
+    minutes = (warming.since_s[last] - warming.since_s[-1]) / 60
+    terms = np.stack([np.ones_like(minutes), minutes], axis=1)
+    fitted = np.linalg.lstsq(terms, 1e3 * warming.moved[last, :2], rcond=None)[0]
+    left = 1e3 * warming.moved[last, :2] - terms @ fitted
+    variance = float((left**2).sum()) / max(2 * int(last.sum()) - 4, 1)
+    u = math.sqrt(variance * float(np.linalg.inv(terms.T @ terms)[1, 1]))
+    within_min = float(np.ptp(minutes))
+    lines = (
+        direct("scatter of the frames about a line", "A", u, unit, "least squares"),
+        Contribution("what does not repeat", "A", 1e3 * math.hypot(scatter[0], scatter[1]), "mpx", 0.1 / within_min,
+                     "a tenth of what the chosen form leaves may fall into these minutes"),
+    )  # fmt: skip
+    model = "length of the slope of a line through I and J over the last five minutes"
+    return Quantity(key, _SWITCHING_ON, name, unit, float(np.linalg.norm(fitted[1])), model, lines)
+
+
+def _self_heating(visits: Visits, u_air_K: float) -> Quantity:
+    name, model = "Self-heating, by its own sensor", "camera's own sensor minus the air near it, at the reference"
+    excess = visits.camera_degC - visits.air_degC
+    if not len(excess):
+        return Quantity(
+            "self_heating_K", _SWITCHING_ON, name, "K", math.nan, model, (), "no air temperature near the camera"
+        )
+    lines = (
+        direct("thermometer and its place", "B", u_air_K, "K", "stated, else assumed"),
+        direct("the camera's sensor", "B", 0.25 / math.sqrt(12), "K", "steps of at most 0.25 K; its offset is unknown"),
+    )
+    return Quantity("self_heating_K", _SWITCHING_ON, name, "K", float(excess[0]), model, lines)
+
+
+def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float) -> Quantity:
+    """Of the shift per K of the air, how much the camera's own warming moves the image per K of its own sensor. The
+    rest follows the surroundings: mount, fixture, and what of the camera stays at the air's temperature then."""
+    key, name = "camera_share", "Part of the shift that follows the camera itself"
+    model = (
+        "(h · c) / (c · c); h: shift in the warm-up per K of the camera's sensor, c: shift per K of the air; the rest "
+        "follows mount and surroundings, which are taken to stay at the air's temperature in the warm-up; above 100 % "
+        "they move the image back"
+    )
+    fitted = [curve(visits, axis) for axis in (0, 1)]
+    if warming is None or fitted[0] is None or fitted[1] is None:
+        return Quantity(
+            key, _SWITCHING_ON, name, "%", math.nan, model, (), _NO_WARM_UP if warming is None else _NO_CURVE
+        )
+    slope = np.array([one.slope for one in fitted if one])
+    u_slope = np.array([one.u_slope for one in fitted if one])
+    risen_K = float(warming.camera_degC[-1] - warming.camera_degC[0])
+    size = float(slope @ slope)
+    if risen_K < 2 or size < 1e-10:
+        return Quantity(key, _SWITCHING_ON, name, "%", math.nan, model, (), "the camera warmed by less than 2 K")
+    h = warming.moved[-1, :2] / risen_K
+    share = float(h @ slope) / size
+    by_slope = (h - 2 * share * slope) / size
+    lines = (
+        Contribution("drift in the warm-up", "A", math.sqrt(2) * max(scatter[:2]), "px",
+                     100 / (risen_K * math.sqrt(size)), UNREPEATED),
+        Contribution("coefficient along I", "A", float(u_slope[0]), "px/K", 100 * float(by_slope[0]), "as above"),
+        Contribution("coefficient along J", "A", float(u_slope[1]), "px/K", 100 * float(by_slope[1]), "as above"),
+        Contribution("warming of the camera", "B", u_air_K, "K", 100 * share / risen_K, "of its own sensor"),
+    )  # fmt: skip
+    return Quantity(key, _SWITCHING_ON, name, "%", 100 * share, model, lines)
+
+
+def _rest(share: Quantity) -> Quantity:
+    """What the camera's share leaves, as uncertain as that."""
+    lines = tuple(replace(line, sensitivity=-line.sensitivity) for line in share.contributions)
+    name, model = "Part of the shift that follows mount and surroundings", "100 % less the part that follows the camera"
+    return replace(share, key="mount_share", name=name, value=100 - share.value, model=model, contributions=lines)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,22 +10,161 @@ Pure: what was observed goes in, a decision comes out, the same for the same obs
 from __future__ import annotations
 
 import math
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from thermostand.compensation.design.courses import Known, best_course
-from thermostand.compensation.design.forecast import Situation, now, surroundings
-from thermostand.compensation.design.wanted_states import wanted_states
+from thermostand.compensation.design.forecast import (
+    Situation,
+    Surroundings,
+    after,
+    at_rest,
+    now,
+    surroundings,
+    together,
+)
 from thermostand.compensation.drift.candidates import FEWEST_BETWEEN
 from thermostand.compensation.drift.terms import features
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.history.states import Float
-from thermostand.compensation.observations import Observations
+from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.history.thermal_history import recorded_history
+from thermostand.compensation.observations import Observations, observe
 from thermostand.experiments.steps import WANTED_STATES, Role, WantedState
 from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.layout import FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_unfinished
+
+_PLACES = 7
+_AFTER_S: dict[WantedState, float] = {"at_rest": 4 * 3600.0, "on_the_way": 2700.0}
+
+
+def wanted_states(
+    around: Surroundings, memory: Memory, range_degC: tuple[float, float], kinds: Sequence[WantedState]
+) -> Situation:
+    """Of a powered camera throughout the range: so long after it was brought there from rest in the middle, or half way
+    to either end. Both ways to a temperature and what creeps are in these. ValueError without a kind."""
+    low, high = range_degC
+    pairs = np.array(list(product(np.linspace(low, high, 5)[1:4], np.linspace(low, high, _PLACES))))
+    begun = at_rest(around, pairs[:, 0], memory)
+    return together([after(around, begun, pairs[:, 1], np.full(len(pairs), _AFTER_S[kind])) for kind in kinds])
+
+
+_HORIZON_S = 8 * 3600.0
+_DRAWN = 40
+"""Courses of each kind, drawn from the whole grid and from each of its thirds."""
+_THIRDS, _EVERY = 3, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """covariance (H, H), px^2: of the coefficients. noise_px2: of one more instant. wanted (W, H): features of the
+    states in which the model is wanted. features: of situations (S,), (S, H)."""
+
+    covariance: Float
+    noise_px2: float
+    wanted: Float
+    features: Callable[[Situation], Float]
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """The first visit of a course. variance_px2: of the model after all of it, mean over the wanted states."""
+
+    chamber_degC: float
+    dwell_s: float
+    variance_px2: float
+
+
+def best_course(
+    known: Known, here: Situation, around: Surroundings, grid_degC: Float, dwells_s: Sequence[float], seed: int
+) -> Course:
+    """Of courses of each dwell, about as long together: the one after which the mean variance over the wanted states is
+    least. The same for a seed."""
+    rng = np.random.default_rng([20, seed])
+    moment = known.wanted.T @ known.wanted / len(known.wanted)
+    best: Course | None = None
+    for dwell_s in dwells_s:
+        set_points = _drawn(grid_degC, max(1, round(_HORIZON_S / dwell_s)), rng)
+        variance_px2 = _after_courses(known, here, around, set_points, dwell_s, moment)
+        first = int(np.argmin(variance_px2))
+        found = Course(float(set_points[first, 0]), dwell_s, float(variance_px2[first]))
+        best = found if best is None or found.variance_px2 < best.variance_px2 else best
+    if best is None:
+        raise ValueError("there is no dwell to choose from")
+    return best
+
+
+def _after_courses(
+    known: Known, here: Situation, around: Surroundings, set_points: Float, dwell_s: float, moment: Float
+) -> Float:
+    """(S,), px^2: the variance after each course (S, visits); the covariance of each is updated visit by visit (the
+    Sherman-Morrison formula)."""
+    count = len(set_points)
+    at = here.where(np.zeros(count, np.int64))
+    covariance = np.repeat(known.covariance[None], count, axis=0)
+    for visit in set_points.T:
+        at = after(around, at, visit, np.full(count, dwell_s))
+        own = known.features(at)
+        gain = np.einsum("skl,sl->sk", covariance, own)
+        total = known.noise_px2 + (gain * own).sum(axis=1)
+        covariance -= gain[:, :, None] * gain[:, None, :] / total[:, None, None]
+    return np.einsum("skl,lk->s", covariance, moment)
+
+
+def _drawn(grid_degC: Float, visits: int, rng: np.random.Generator) -> Float:
+    """(S, visits): to and fro, steadily up or down, staying at one temperature, and at one after the other. What creeps
+    for hours shows in those that stay or go one way, which are hardly ever drawn by chance."""
+    parts = [grid_degC, *(third for third in np.array_split(grid_degC, _THIRDS) if len(third))]
+    to_and_fro = [rng.choice(part, (_DRAWN, visits)) for part in parts]
+    up = [np.sort(rng.choice(part, (_DRAWN // 2, visits)), axis=1) for part in parts]
+    down = [np.sort(rng.choice(part, (_DRAWN // 2, visits)), axis=1)[:, ::-1] for part in parts]
+    staying = np.repeat(grid_degC[:, None], visits, axis=1)
+    pairs = np.array(list(product(grid_degC[::_EVERY], repeat=2)))
+    first = visits // 2
+    both = np.hstack([np.repeat(pairs[:, :1], first, axis=1), np.repeat(pairs[:, 1:], visits - first, axis=1)])
+    return np.concatenate([*to_and_fro, *up, *down, staying, both])
+
+
+def recorded_so_far(session: Path) -> Observations:
+    """The frames so far, with the telemetry up to the last of them: what comes in while somebody waits for a decision
+    changes nothing. SessionError when there is nothing to be read, or no frame can be used."""
+    with tempfile.TemporaryDirectory(prefix="thermostand-known-") as folder:
+        copy = Path(folder) / session.name
+        for series in (TELEMETRY, FRAMES):
+            (copy / series).mkdir(parents=True)
+            for segment in sorted((session / series).iterdir()) if (session / series).is_dir() else ():
+                _taken(segment, copy / series)
+        salvage_unfinished(Path(folder))
+        observed = observe(copy, incomplete=_unreported)
+        history = recorded_history(Session.open(copy), int(observed.time_ns[-1]))
+        return replace(observed, histories=(history,))
+
+
+def _taken(segment: Path, folder: Path) -> None:
+    """A segment may be finished between the list and the look at it."""
+    finished = segment.with_name(f"{segment.name.partition('.')[0]}{FINISHED}")
+    try:
+        if segment.name.endswith(UNFINISHED) and not finished.exists():
+            shutil.copyfile(segment, folder / segment.name)
+        elif finished.exists() and not (folder / finished.name).exists():
+            (folder / finished.name).symlink_to(finished.absolute())
+    except FileNotFoundError:
+        if not finished.exists():
+            raise SessionError(f"{segment}: was removed while it was read") from None
+        (folder / finished.name).symlink_to(finished.absolute())
+
+
+def _unreported(sentence: str) -> None:
+    """A night under way lacks its rest."""
+
 
 _GRID = 13
 _APART_K = 1.0
@@ -38,7 +177,7 @@ class Wanted:
     """What a night is for, and within what it decides. range_degC: set-points at which the model is wanted; none
     outside is chosen, nor one of held_out_degC. residual_px: the predicted residual with which the night is content.
     dwells_s: to choose from. ramp_K_per_min: of the chamber, at most. states: in which the model is wanted there, see
-    wanted_states.py."""
+    wanted_states."""
 
     range_degC: tuple[float, float]
     residual_px: float

@@ -19,8 +19,7 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     Plain values: the daemon that reads them has nothing of this package."""
     import cv2
 
-    from thermostand.compensation.design.next_visit import Wanted, decide
-    from thermostand.compensation.design.unfinished_night import recorded_so_far
+    from thermostand.compensation.design.next_visit import Wanted, decide, recorded_so_far
     from thermostand.experiments.steps import WANTED_STATES
 
     cv2.setNumThreads(1)

@@ -11,8 +11,18 @@ import numpy as np
 from thermostand.compensation.drift.candidates import Candidate, as_good_as_best, discrepancy_px, fold_means, pair_of
 from thermostand.compensation.drift.displacements import Displacements, displacements
 from thermostand.compensation.drift.facts import facts_of
-from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel
-from thermostand.compensation.drift.polynomial import Float, Scaling, Solution, condense, design, exponents, solve
+from thermostand.compensation.drift.paper_model import (
+    MAX_DEGREE,
+    DegreeScore,
+    Float,
+    PaperModel,
+    Scaling,
+    Solution,
+    condense,
+    design,
+    exponents,
+    solve,
+)
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import ConfigError, SessionError

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from thermostand.compensation.budget.budget import Budget
-from thermostand.compensation.calibration.visits import visits_for
+from thermostand.compensation.calibration.session_centres import visits_for
 from thermostand.compensation.datasheet.details import Details
 from thermostand.compensation.drift.bump import Bump
 from thermostand.compensation.drift.bumps import around_bumps, find_bumps
@@ -31,8 +31,7 @@ from thermostand.compensation.drift.evaluation import (
     improvement_percent,
 )
 from thermostand.compensation.drift.hysteresis import Hysteresis, hysteresis
-from thermostand.compensation.drift.paper_model import PaperModel
-from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.drift.paper_model import PaperModel, exponents
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.drift.unrepeated import Unrepeated, find_unrepeated

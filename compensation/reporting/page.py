@@ -20,8 +20,8 @@ from thermostand.compensation.drift.evaluation import improvement_percent
 from thermostand.compensation.reporting.drawing.drawing import Draw, one_by_one
 from thermostand.compensation.reporting.numbers import compact, measured, percent, significant, typeset
 from thermostand.compensation.validation3d import paper
+from thermostand.compensation.validation3d.document import flagged, reason_names, with_limit
 from thermostand.compensation.validation3d.validate import Validation
-from thermostand.compensation.validation3d.validation_text import flagged, reason_names, with_limit
 from thermostand.foundation.errors import ConfigError
 
 NamedFigure = tuple[str, Figure]

@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.calibration.visits import Visit, place, visits_for
+from thermostand.compensation.calibration.session_centres import Visit, place, visits_for
 from thermostand.compensation.observations import Float, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError

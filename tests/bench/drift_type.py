@@ -10,8 +10,8 @@ from tests.bench.drift_drawn import effects_of, score
 from tests.bench.figures import Figure, absolute, at_least, progress, ratio_at_most, side_by_side
 from tests.compensation.drawn_cameras import drawn_unit
 from tests.compensation.drawn_nights import cycle, full_night, night, reference, warm_up
+from thermostand.compensation.drift.anchoring import fit_like
 from thermostand.compensation.drift.thermal_learning import fit_thermal
-from thermostand.compensation.drift.type_prior import fit_like
 from thermostand.experiments.steps import Role
 
 TYPES, FIRST, UNITS, NEW = 10, 7800, 6, 99

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.drift.facts import ModelFacts
-from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel
-from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, exponents
 from thermostand.compensation.drift.terms import (
     AmbientLag,
     AmbientLagCubed,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from thermostand.compensation.budget.refraction import KELVIN, Index, ciddor_1996, edlen_1966, saturation_Pa
+from thermostand.compensation.budget.budget import KELVIN, Index, ciddor_1996, edlen_1966, saturation_Pa
 
 
 def birch_downs_1994(temperature_degC: float, pressure_Pa: float, vapour_Pa: float, wavelength_um: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermostand.compensation.drift.between_nights import between_nights
+from thermostand.compensation.drift.thermal_model import between_nights
 
 NONE_PX2 = np.zeros((0, 2))
 

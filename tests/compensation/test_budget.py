@@ -14,11 +14,17 @@ import pytest
 from typer.testing import CliRunner
 
 from thermostand.compensation import cli
-from thermostand.compensation.budget.budget import Budget, budget
-from thermostand.compensation.budget.correction import displacement_px, granite_mm, post_mm, varied
+from thermostand.compensation.budget.budget import (
+    Budget,
+    budget,
+    displacement_px,
+    granite_mm,
+    home_residuals,
+    mean_state,
+    post_mm,
+    varied,
+)
 from thermostand.compensation.budget.geometry import Geometry, StandTemperatures, load_geometry
-from thermostand.compensation.budget.repeatability import home_residuals
-from thermostand.compensation.budget.session_temperatures import mean_state
 from thermostand.drivers.sim.physics import optics
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import ConfigError

@@ -11,11 +11,10 @@ from thermostand.compensation.calibration.adjustment import Adjustment, adjust
 from thermostand.compensation.calibration.calibrate import Model, calibrate
 from thermostand.compensation.calibration.camera_file import camera_file
 from thermostand.compensation.calibration.model_scores import BROWN, best, halves, rays_of
-from thermostand.compensation.calibration.opencv import calibrate_opencv
+from thermostand.compensation.calibration.pinhole import calibrate_opencv
 from thermostand.compensation.calibration.pose import find_pose
-from thermostand.compensation.calibration.seen_area import NOT_SEEN
 from thermostand.compensation.calibration.stage_geometry import TableSigma
-from thermostand.compensation.calibration.uncertainty import difference, projection_uncertainty
+from thermostand.compensation.calibration.uncertainty import NOT_SEEN, difference, projection_uncertainty
 from thermostand.compensation.commands.calibration_cli import summary
 from thermostand.compensation.reporting.pages import calibration_page
 from thermostand.compensation.validation3d.validate import LensModel, camera_of

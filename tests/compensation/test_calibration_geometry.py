@@ -6,15 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
+from thermostand.compensation.calibration.adjustment import table_from_poses
 from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.bundle import Problem, Scene, problem_of
 from thermostand.compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
-from thermostand.compensation.calibration.hand_eye import table_from_poses
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise
-from thermostand.compensation.calibration.pinhole import Pinhole
+from thermostand.compensation.calibration.pinhole import Pinhole, across
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.rays import fit_rays
-from thermostand.compensation.calibration.rotation import across
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.foundation.errors import CalibrationError
 

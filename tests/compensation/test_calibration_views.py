@@ -13,9 +13,15 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.exports import EXPORTS
-from thermostand.compensation.calibration.seen_area import NOT_SEEN
-from thermostand.compensation.calibration.view_uncertainty import known, projection_sigma_um
-from thermostand.compensation.calibration.views import ViewCalibration, Views, calibrate_views, cross_validated_px
+from thermostand.compensation.calibration.uncertainty import NOT_SEEN
+from thermostand.compensation.calibration.views import (
+    ViewCalibration,
+    Views,
+    calibrate_views,
+    cross_validated_px,
+    known,
+    projection_sigma_um,
+)
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import CalibrationError
 

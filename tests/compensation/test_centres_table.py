@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from thermostand.compensation import cli
-from thermostand.compensation.centres_table import observations_of_table
+from thermostand.compensation.arrays import observations_of_table
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift_runtime import Drift
 from thermostand.foundation.errors import SessionError

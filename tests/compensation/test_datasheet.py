@@ -13,11 +13,10 @@ import pytest
 from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app
-from thermostand.compensation.datasheet.datasheet import Datasheet, datasheet
+from thermostand.compensation.datasheet.datasheet import Datasheet, datasheet, frame_noise, warming_quantities
 from thermostand.compensation.datasheet.details import Details, load_details
 from thermostand.compensation.datasheet.motions import Visits, Warming, motions
 from thermostand.compensation.datasheet.quantity import NIGHTS, Contribution, Quantity, direct, pooled
-from thermostand.compensation.datasheet.warming import frame_noise, warming_quantities
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.observations import Observations

@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermostand.compensation.design.courses import Known, best_course
 from thermostand.compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
-from thermostand.compensation.design.next_visit import Decision, Wanted, decide
-from thermostand.compensation.design.wanted_states import wanted_states
+from thermostand.compensation.design.next_visit import Decision, Known, Wanted, best_course, decide, wanted_states
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.expression import AIR, CAMERA, lag, play
 from thermostand.compensation.history.states import Float, Memory

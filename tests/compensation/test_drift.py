@@ -14,8 +14,7 @@ from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.hull import convex_hull
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.paper_fit import choose, fit_paper
-from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel
-from thermostand.compensation.drift.polynomial import condense, design, solve
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, condense, design, solve
 from thermostand.compensation.history.states import States
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.experiments.steps import Role

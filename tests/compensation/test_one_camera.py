@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 from thermostand.compensation.cli import app
 from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.model_file import save_model
-from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel
-from thermostand.compensation.drift.polynomial import exponents
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, exponents
 from thermostand.compensation.history.thermal_history import recorded_history
 from thermostand.compensation.observations import observe
 from thermostand.compensation.one_camera import name_of, own_frames, take

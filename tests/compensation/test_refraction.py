@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from thermostand.compensation.budget.refraction import appears_px, ciddor_1996, edlen_1966, shift_mm, tilted_shift_mm
+from thermostand.compensation.budget.budget import appears_px, ciddor_1996, edlen_1966, shift_mm, tilted_shift_mm
 
 WARM, LABORATORY = (1 + ciddor_1996(degC, 101325.0, 0.0, 0.55) for degC in (54.0, 24.0))
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from thermostand.compensation.drift.anchoring import fit_like
 from thermostand.compensation.drift.evaluation import rms_px
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states
-from thermostand.compensation.drift.type_prior import fit_like
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
 

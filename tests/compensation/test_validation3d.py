@@ -11,21 +11,19 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.calibration.adjustment import adjust
-from thermostand.compensation.calibration.averages import mean_centres
 from thermostand.compensation.calibration.calibrate import Model, calibrate
 from thermostand.compensation.calibration.camera_file import CameraFile, camera_file
+from thermostand.compensation.calibration.session_centres import mean_centres
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.compensation.drift.drift_model import Outside
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.observations import Float
 from thermostand.compensation.reporting.pages import validation_page
-from thermostand.compensation.validation3d.deviations import Camera, Deviations, deviations
-from thermostand.compensation.validation3d.document import as_json
+from thermostand.compensation.validation3d.deviations import Camera, Deviations, Doubts, deviations, find
+from thermostand.compensation.validation3d.document import as_json, summary
 from thermostand.compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from thermostand.compensation.validation3d.poses import Doubts, find
 from thermostand.compensation.validation3d.validate import LensModel, Validation, camera_of, check_same, validate
-from thermostand.compensation.validation3d.validation_text import summary
 from thermostand.foundation.errors import CalibrationError, SessionError
 
 from .calibration_cases import board, positions, target_of
