@@ -173,7 +173,7 @@ def _watched(assembly: Assembly) -> Assembly:
     register_map = load_register_map(packaged("registers", section.registers)).at_unit(section.unit)
     channels = {str(name): number for name, number in section.channels.items()}
     relays = WatchedRelays("relays", assembly.bus, register_map, channels)
-    return replace(assembly, devices=replace(assembly.devices, relays=relays))
+    return replace(assembly, devices=replace(assembly.devices, every={**assembly.devices.every, "relays": relays}))
 
 
 def _sensors(devices: Devices):
