@@ -14,7 +14,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -100,7 +100,7 @@ class DayRecord:
 
     async def _begun(self) -> Recorder:
         day = self._today()
-        info = self._info(await self._lane.call(self._place, day))
+        info = await self._lane.call(self._place, day)
         directory = self._out / info.session_id
         tap, disk = _Tap(self._assembly.hub), Disk()
         recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk)
@@ -150,24 +150,25 @@ class DayRecord:
         now_s = (self._clock.now_ns() + self._clock.utc_offset_ns()) / NS_PER_S
         return f"{datetime.fromtimestamp(now_s).astimezone():%Y%m%d}"
 
-    def _place(self, day: str) -> str:
-        """The name of the day's session; `-2`, `-3` ... when there is one that another program, or a stand with another
-        configuration, has recorded, or that cannot be read."""
+    def _place(self, day: str) -> SessionInfo:
+        """The day's session, which goes on; `-2`, `-3` ... when there is one that another program, or a stand with
+        another configuration, has recorded, or that cannot be read."""
         first = f"{day}-{BETWEEN_RUNS}"
         names = itertools.chain([first], (f"{first}-{number}" for number in itertools.count(2)))
-        return next(name for name in names if self._may_continue(self._out / name))
+        return next(info for name in names if (info := self._continued(self._out / name)) is not None)
 
-    def _may_continue(self, directory: Path) -> bool:
+    def _continued(self, directory: Path) -> SessionInfo | None:
+        """Who records there: as before, where that can be; None where it cannot."""
+        info = self._info(directory.name)
         if not os.path.lexists(directory):
-            return True
+            return info
         try:
             session = Session.open(directory)
-            return (
-                SessionInfo.of(session.metadata) == self._info(directory.name)
-                and dict(session.attachments) == self._texts
-            )
+            before = SessionInfo.of(session.metadata)
+            is_same = replace(info, uid=before.uid) == before and dict(session.attachments) == self._texts
         except (SessionError, OSError, LookupError, ValueError):
-            return False
+            return None
+        return before if is_same else None
 
     def _info(self, name: str) -> SessionInfo:
         config = self._assembly.config
