@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from itertools import chain
 from struct import Struct, pack
 
-import deflate
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -140,7 +139,7 @@ class McapWriter:
         name = _COMPRESSION_NAMES[self._compression]
         parts, crc = chunk.parts, 0
         for part in parts:
-            crc = deflate.crc32(part, crc)
+            crc = zlib.crc32(part, crc)
         if name:
             parts = [zstandard.compress(b"".join(parts), self._level)]
         stored_bytes = sum(map(len, parts))
