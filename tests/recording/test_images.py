@@ -149,7 +149,7 @@ def test_the_table_of_frames_has_every_description():
 def bad_messages():
     good = RawImage.FromString(encode_image(frame(np.zeros((4, 6), np.uint8))))
     whole = good.SerializeToString()
-    for size in range(len(whole)):
+    for size in range(61):  # behind that stands the channel's name alone
         yield whole[:size]
     short = RawImage(width=6, height=4, step=6, encoding="mono8", data=good.data[:-1])
     colour = RawImage(width=6, height=4, step=18, encoding="rgb8", data=bytes(72))
@@ -162,8 +162,6 @@ def bad_messages():
 
 @pytest.mark.parametrize("data", list(bad_messages()))
 def test_a_damaged_message_is_a_session_error(data):
-    if data == b"".join((encode_image(frame(np.zeros((4, 6), np.uint8)))[: len(data)],)) and len(data) > 60:
-        pytest.skip("only the channel's name is cut off")
     with pytest.raises(SessionError):
         decode_image(data)
 
