@@ -5,7 +5,7 @@
         "Leave a step out, or break it off."
 
 From it follow the route and its OpenAPI (api/order_routes.py), the verb of the command line (commands/verbs.py), the
-command that is recorded (`perform`), SECoP's command of the module `run`, and what the page's buttons are called
+command that is recorded (`perform`), SECoP's command of the module `run`, and where the page sends an order
 (`GET /api/v1/commands`).
 """
 
@@ -15,7 +15,7 @@ import inspect
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import takewhile
 from typing import Any, Literal, TypeVar, cast, get_type_hints
 
@@ -91,7 +91,7 @@ def command(
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class Command(_Mark):
     """name: as it is typed and recorded. text: of its docstring. argument: None when it takes none."""
 
     name: str
@@ -99,12 +99,6 @@ class Command:
     text: str
     argument: type[Document] | None
     answer: type[BaseModel]
-    path: str
-    http: Http
-    status: int
-    has_verb: bool
-    anywhere: bool
-    by_secop: str | None
 
     @property
     def title(self) -> str:
@@ -148,17 +142,12 @@ def _command(method_name: str, method: Callable[..., object], mark: _Mark) -> Co
     answer = hints.pop("return")
     argument = [hint for hint in hints.values() if hint is not Who]
     return Command(
-        method_name.rstrip("_"),
-        method_name,
-        inspect.getdoc(method) or "",
-        cast("type[Document]", argument[0]) if argument else None,
-        Done if answer is str else cast("type[BaseModel]", answer),
-        mark.path,
-        mark.http,
-        mark.status,
-        mark.has_verb,
-        mark.anywhere,
-        mark.by_secop,
+        **asdict(mark),
+        name=method_name.rstrip("_"),
+        method=method_name,
+        text=inspect.getdoc(method) or "",
+        argument=cast("type[Document]", argument[0]) if argument else None,
+        answer=Done if answer is str else cast("type[BaseModel]", answer),
     )
 
 
