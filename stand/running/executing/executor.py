@@ -276,7 +276,6 @@ class Executor:
                 await self._aim(capture)
             case TakeAgain(planned, why, frames_lost):
                 await self._begin_again((planned,), why, frames_lost)
-                await self._log.write(Step(self._clock.now_ns(), planned.step_id, "started"))
             case TakeFrame():
                 await self._take(action)
             case Perform(planned):

@@ -88,7 +88,7 @@ async def end_endless_holds(
                 minutes = _CLEARED_WITHIN_S / 60
                 raise NotCleared(f"held for {minutes:g} min of virtual time, and nobody cleared it: {fault.text}")
             if now_ns - since_ns >= seconds_ns(3600.0 * limit_h):
-                reasons = ", ".join(sorted(gate.reasons))
+                reasons = fault.text if fault else ", ".join(sorted(gate.reasons))
                 raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody continued it")
             await _opens_within(gate, clock, _ENDLESS_LOOK_S)
     finally:
