@@ -59,6 +59,20 @@ def _ip_address(address: str) -> str:
         raise ValueError("expected an IPv4 address such as 192.168.1.10") from error
 
 
+_STATED: dict[str, str] = {}  # where a stand's simulator answers -> what the stand's file says
+
+
+def state_as(address: str, stated: str) -> None:
+    """From now on `stated` is said where something is said of `address`: a simulator answers at a free place, which is
+    another one each time, and the messages of a run are recorded."""
+    _STATED[address] = stated
+
+
+def stated(address: str) -> str:
+    """How a message names `address`: as the stand's file does."""
+    return _STATED.get(address, address)
+
+
 ByteAddress = Annotated[str, AfterValidator(_byte_address)]
 TcpAddress = Annotated[str, AfterValidator(_tcp_address)]
 IpAddress = Annotated[str, AfterValidator(_ip_address)]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 
 from thermostand.drivers.camera_preset import CameraPreset
 from thermostand.drivers.devices.kinds import Equipment
-from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.addresses import state_as, tcp_place
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.errors import ConfigError, Refused, Unreachable
@@ -99,12 +99,17 @@ def _dress_of(camera: SimulatedCamera) -> dict[str, object]:
 
 
 def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
-    """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses)."""
+    """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses), of which
+    messages say what the file of `config` states."""
     moved = {
         name: settings.model_validate({**settings.model_dump(exclude_unset=True), kind.address_key: addresses[name]})
         for name, kind, settings in config.equipment
         if settings is not None and kind.address_key
     }
+    for name, kind, settings in config.equipment:
+        if name in moved and (address := getattr(settings, kind.address_key)):
+            state_as(addresses[name], address)
+    state_as(addresses["bus"], config.bus.address)
     update = config.sections_with(moved) | {"bus": config.bus.model_copy(update={"address": addresses["bus"]})}
     simulation = config.simulation
     update["simulation"] = simulation and simulation.model_copy(update={"control": addresses["control"]})

@@ -41,6 +41,7 @@ from thermostand.drivers.wires.camera_temperature import (
     temperature_place,
 )
 from thermostand.drivers.wires.frame_count import FrameCount
+from thermostand.foundation.addresses import stated
 from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
 from thermostand.foundation.errors import Refused
 from thermostand.foundation.readings import Cause
@@ -393,7 +394,7 @@ def _open_controlled(name: str, settings: AravisCameraSettings) -> GigeDevice:
         device = GigeDevice(settings.address)
         if device.is_gige != wants_gige:
             device.close()
-            raise Refused(name, f"{settings.address} is {'no' if wants_gige else 'a'} GigE Vision camera")
+            raise Refused(name, f"{stated(settings.address)} is {'no' if wants_gige else 'a'} GigE Vision camera")
         if device.is_controller():
             return device
         device.close()

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import serial
 
-from thermostand.foundation.addresses import SerialPlace, place_of
+from thermostand.foundation.addresses import SerialPlace, TcpPlace, place_of, stated
 from thermostand.foundation.errors import Unreachable
 
 _CONNECT_S = 1.0
@@ -53,17 +53,17 @@ def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
     `address` is neither."""
     place = place_of(address)
     if isinstance(place, SerialPlace):
-        return _SerialLink(device, place.path, settings)
-    return _TcpLink(device, place.host, place.port)
+        return _SerialLink(device, place.path, stated(address).removeprefix("serial:"), settings)
+    return _TcpLink(device, place, stated(address).removeprefix("tcp:"))
 
 
 class _SerialLink:
     """A port opened by pyserial. Its bytes go by the descriptor: pyserial waits twice for each reply, and after each
     request for room for the next one."""
 
-    def __init__(self, device: str, path: str, settings: SerialSettings) -> None:
+    def __init__(self, device: str, path: str, where: str, settings: SerialSettings) -> None:
         self._device = device
-        self._path = path
+        self._where = where
         try:
             self._port = serial.Serial(
                 path,
@@ -76,14 +76,14 @@ class _SerialLink:
                 exclusive=True,
             )
         except (OSError, termios.error) as error:
-            raise Unreachable(device, f"cannot open {path}: {why_closed(error)}") from error
+            raise Unreachable(device, f"cannot open {where}: {why_closed(error)}") from error
 
     def write(self, data: bytes) -> None:
         try:
             if rest := data[_taken_at_once(self._port.fileno(), data) :]:
                 self._port.write(rest)  # waits for room
         except (OSError, termios.error) as error:
-            raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
+            raise Unreachable(self._device, f"{self._where} is gone ({error})") from error
 
     def read(self, timeout_s: float) -> bytes:
         try:
@@ -94,9 +94,9 @@ class _SerialLink:
         except BlockingIOError:
             return b""
         except (OSError, termios.error) as error:
-            raise Unreachable(self._device, f"{self._path} is gone ({error})") from error
+            raise Unreachable(self._device, f"{self._where} is gone ({error})") from error
         if not data:  # ready, and yet nothing: unplugged
-            raise Unreachable(self._device, f"{self._path} is gone (nothing to read where there should be)")
+            raise Unreachable(self._device, f"{self._where} is gone (nothing to read where there should be)")
         return data
 
     def close(self) -> None:
@@ -154,13 +154,13 @@ def why_closed(error: Exception) -> str:
 
 
 class _TcpLink:
-    def __init__(self, device: str, host: str, port: int) -> None:
+    def __init__(self, device: str, place: TcpPlace, where: str) -> None:
         self._device = device
-        self._where = f"{host}:{port}"
+        self._where = where
         try:
-            self._socket = socket.create_connection((host, port), timeout=_CONNECT_S)
+            self._socket = socket.create_connection(place, timeout=_CONNECT_S)
         except OSError as error:
-            raise Unreachable(device, f"cannot connect to {self._where}: {error.strerror or error}") from error
+            raise Unreachable(device, f"cannot connect to {where}: {error.strerror or error}") from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes) -> None:

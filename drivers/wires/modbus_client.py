@@ -27,7 +27,7 @@ from pymodbus.pdu.register_message import WriteMultipleRegistersRequest, WriteSi
 from thermostand.drivers.wires.link import CLOSING_S, HangUps, why_closed
 from thermostand.drivers.wires.modbus_messages import READS, REPLIES, Decoder, WriteCoilWord
 from thermostand.drivers.wires.registers import Space
-from thermostand.foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of
+from thermostand.foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of, stated
 from thermostand.foundation.documents import Document
 
 # Every fault is raised and counted here; pymodbus would print it a second time on stderr.
@@ -206,6 +206,7 @@ class ModbusClient:
     def __init__(self, settings: BusSettings) -> None:
         self._settings = settings
         self._place = place_of(settings.address)
+        self._where = stated(settings.address)
         self.serial = isinstance(self._place, SerialPlace)
         self._client: SerialClient | TcpClient | None = None
         self.hang_ups = 0  # connections that the peer had closed before the next request
@@ -226,7 +227,7 @@ class ModbusClient:
             client.connect()
         except (OSError, termios.error) as error:
             client.close()
-            text = f"cannot open {self._settings.address}: {why_closed(error)}"
+            text = f"cannot open {self._where}: {why_closed(error)}"
             raise WireFault(FaultKind.LINE_DOWN, text) from error
         self._client = client
         self._manners.opened()
@@ -346,20 +347,20 @@ class ModbusClient:
     def _execute(self, request: ModbusPDU) -> ModbusPDU:
         client = self._client
         if client is None:
-            raise WireFault(FaultKind.LINE_DOWN, f"{self._settings.address} is closed")
+            raise WireFault(FaultKind.LINE_DOWN, f"{self._where} is closed")
         self._heard = b""
         try:
             return client.execute(False, request)
         except ConnectionException as error:
             self.close()
-            raise WireFault(FaultKind.LINE_DOWN, f"{self._settings.address} is gone: {error.string}") from error
+            raise WireFault(FaultKind.LINE_DOWN, f"{self._where} is gone: {error.string}") from error
         except ModbusException as error:
             if self._heard:
                 raise WireFault(FaultKind.GARBLED, f"no valid reply in {self._heard.hex(' ')}") from error
             raise WireFault(FaultKind.SILENCE, f"no reply within {self._settings.timeout_s:g} s") from error
         except (OSError, termios.error) as error:
             self.close()
-            raise WireFault(FaultKind.LINE_DOWN, f"{self._settings.address} is gone: {error}") from error
+            raise WireFault(FaultKind.LINE_DOWN, f"{self._where} is gone: {error}") from error
 
     def _trace(self, sending: bool, data: bytes) -> bytes:
         """pymodbus hands every packet here: what went out, and what has come and is not yet a frame."""

@@ -12,6 +12,7 @@ import pytest
 from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.wire import PtyWire, TcpWire
 from thermostand.drivers.wires.link import ByteLink, SerialSettings, open_link
+from thermostand.foundation.addresses import state_as
 from thermostand.foundation.errors import Unreachable
 
 LINE = SerialSettings(baud=115200, stopbits=2)
@@ -93,6 +94,17 @@ def test_a_second_opener_of_a_serial_port_learns_that_it_is_taken(tmp_path: Path
             open_link("other", address, LINE)
         first.write(b"mine")
         assert read_all(first, 4) == b"mine"
+
+
+@pytest.mark.parametrize("stated", ["serial:/dev/ximc/00001005", "tcp:moxa:4001"])
+def test_a_simulated_port_is_named_as_the_stands_file_does(tmp_path: Path, stated: str) -> None:
+    how, _, name = stated.partition(":")
+    free = {"serial": f"serial:{tmp_path / 'anywhere'}", "tcp": "tcp:127.0.0.1:1"}[how]
+    state_as(free, stated)
+    with pytest.raises(Unreachable) as caught:
+        open_link("stage", free, LINE)
+    assert name in str(caught.value)
+    assert free.removeprefix(f"{how}:") not in str(caught.value)
 
 
 def test_a_missing_port_is_reported_as_such(tmp_path: Path) -> None:

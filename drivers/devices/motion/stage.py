@@ -20,7 +20,7 @@ from thermostand.drivers.devices.motion.stage_profiles import PROFILES, ProfileN
 from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
 from thermostand.drivers.wires.link import SerialSettings, open_link
 from thermostand.drivers.wires.ximc_client import XimcClient
-from thermostand.foundation.addresses import ByteAddress
+from thermostand.foundation.addresses import ByteAddress, stated
 from thermostand.foundation.calls import Lane, Result
 from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.errors import DeviceAlarm, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
@@ -313,7 +313,7 @@ class Axis:
         if serial_number != self._settings.serial_number:
             raise Refused(
                 self.name,
-                f"controller {serial_number} answers at {self._settings.address}, "
+                f"controller {serial_number} answers at {stated(self._settings.address)}, "
                 f"expected {self._settings.serial_number}",
             )
         self.identity = same_device(self.name, identity_of(self._client, serial_number), self.identity)
