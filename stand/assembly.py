@@ -80,8 +80,9 @@ class Assembly:
         met = MetErrors(device_kinds(self.config))
         self.hub.subscribe(met)
         guard = Guard(
-            stand.safety,
-            (
+            safety=stand.safety,
+            latch=stand.latch,
+            watches=(
                 *watches(self.config, announced),
                 Watch(intrusion(lambda: stand.chamber.permits.intrusions), action="hold"),
                 *_obeyed(self.devices.regulator),
@@ -89,16 +90,16 @@ class Assembly:
                 *camera_measured(self.config, frames_to_come),
                 *(recorded(self.config, recording) if recording is not None else ()),
             ),
-            self.hub,
-            self.clock,
-            self.config.guard.period_s,
-            stop,
-            hold,
-            release,
-            stand.cut_camera,
-            self.notifier,
-            met,
-            vital(self.config),
+            hub=self.hub,
+            clock=self.clock,
+            period_s=self.config.guard.period_s,
+            stop=stop,
+            hold=hold,
+            release=release,
+            cut_camera=stand.cut_camera,
+            notifier=self.notifier,
+            met=met,
+            vital=vital(self.config),
         )
         stand.chamber.permits.allowed = guard.may_permit
         return guard

@@ -12,7 +12,7 @@ Listener = Callable[[str, bool], None]
 
 # What may hold a run; each reason is cleared by what has set it.
 OPERATOR = "operator"  # a pause; the chamber keeps its set-point
-INTERLOCK = "interlock"  # the guard has made the chamber safe; only an operator clears it
+INTERLOCK = "interlock"  # the guard has made the chamber safe (set and cleared by the latch alone)
 CAMERA_LOST = "camera_lost"  # until it answers again
 DISK_LOW = "disk_low"  # until frames can be recorded again
 NOT_RECORDED = "not_recorded"  # until the disk takes telemetry again
@@ -62,7 +62,6 @@ class Gate:
         self._open, self._closed = asyncio.Event(), asyncio.Event()
         self._open.set()
         self._listeners: list[Listener] = []
-        self._last: list[Listener] = []
 
     @property
     def reasons(self) -> frozenset[str]:
@@ -73,12 +72,8 @@ class Gate:
         """Call `listener(reason, held)` at once when a reason appears (held) or goes."""
         self._listeners.append(listener)
 
-    def subscribe_last(self, listener: Listener) -> None:
-        """As `subscribe`, behind all others, and for as long as the gate lives."""
-        self._last.append(listener)
-
     def let_go(self) -> None:
-        """Forget the listeners but for the last: the run they belong to has ended."""
+        """Forget the listeners: the run they belong to has ended."""
         self._listeners.clear()
 
     def hold(self, reason: str) -> None:
@@ -108,7 +103,7 @@ class Gate:
         await self._closed.wait()
 
     def _tell(self, reason: str, held: bool) -> None:
-        for listener in (*self._listeners, *self._last):
+        for listener in tuple(self._listeners):
             listener(reason, held)
 
 

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from thermostand.foundation.errors import StandTripped
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import INTERLOCK, STOPPING, Gate
+from thermostand.stand.gate import STOPPING, Gate
+from thermostand.stand.latch import Latch
 
 
 class Interlocked(StandTripped):
@@ -24,30 +24,21 @@ class Mover(Protocol):
 
 
 class Interlock:
-    """Closed by the first fault until the run that it ends is over, and by the gate's interlock until an operator
-    clears it."""
+    """Closed while a run is being ended, and while the latch holds what has tripped."""
 
-    def __init__(self, gate: Gate, movers: Iterable[Mover]) -> None:
-        self.fault: Fault | None = None
+    def __init__(self, latch: Latch, gate: Gate, movers: Iterable[Mover]) -> None:
+        self._latch = latch
         self._gate = gate
         self._movers = tuple(movers)
 
-    def latch(self, fault: Fault) -> None:
-        """Closed until `unlatch`; the first fault stays. Nothing earns time while the stand is being made safe."""
-        self.fault = self.fault or fault
-        self._gate.hold(STOPPING)
-
-    def unlatch(self) -> None:
-        """The run that the latch has ended is over, and the stand was made safe."""
-        self.fault = None
-        self._gate.clear(STOPPING)
-
     def check(self) -> None:
-        """StandTripped after a fault, Interlocked while the guard holds the stand; else everything may move."""
-        if self.fault is not None:
-            raise StandTripped(f"the stand is latched: {self.fault.text}")
-        if INTERLOCK in self._gate.reasons:
-            raise Interlocked("an interlock holds the stand until an operator clears it")
+        """StandTripped while a run is being ended, Interlocked while the guard holds the stand; else everything may
+        move."""
+        fault = self._latch.fault
+        if STOPPING in self._gate.reasons:
+            raise StandTripped(f"the run is being ended: {'stopped' if fault is None else fault.text}")
+        if fault is not None:
+            raise Interlocked(f"an interlock holds the stand until it is cleared: {fault.text}")
         for mover in self._movers:
             mover.allow()  # what making safe has barred, and bars again should it begin before the command is sent
 

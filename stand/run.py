@@ -44,10 +44,9 @@ from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.safe_ranges import accepted_text
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.running.guest import Guest, Job
-from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.opening.claim import claimed, latch_file
 from thermostand.stand.running.opening.clock_watch import ClockWatch
 from thermostand.stand.running.opening.open_stand import OpenStand, Time, opened
-from thermostand.stand.running.opening.stand_latch import StandLatch
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
 from thermostand.stand.running.order import Order, with_register_maps
@@ -272,12 +271,12 @@ async def _kept_on(job: Job, clock: WallClock) -> Path:
             async with stop:
                 return await _run(job, clock, None, stop)
         except StandTripped:
-            if directory is None or stop.is_unsafe or not restarts.may_follow(stop.fault, clock.now_ns()):
+            if directory is None or stop.is_unsafe or not restarts.may_follow(stop.reason, clock.now_ns()):
                 raise
         finally:
             if job.before is not None:
                 job.before.release()
-        await asyncio.to_thread(StandLatch.of(job.order.config).clear)
+        await asyncio.to_thread(latch_file(job.order.config).clear)
         before = await asyncio.to_thread(partial(interruption, directory, job.order.config, clear=True))
         order = replace(before.order, attended=job.order.attended)
         before = replace(before, order=order)
@@ -364,7 +363,7 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
 def _check_latch(job: Job) -> None:
     """StandTripped when the stand has tripped and nobody has cleared it; a run that is resumed after its trip was
     cleared clears it."""
-    latch = StandLatch.of(job.order.config)
+    latch = latch_file(job.order.config)
     if job.before is not None and job.before.state.tripped:
         latch.clear()
     elif (fault := latch.read()) is not None:
@@ -415,7 +414,7 @@ async def _telling_failure(assembly: Assembly, directory: Path, stop: Stop) -> A
         yield
     except Exception as raised:
         error = cause_of(raised)
-        if stop.fault is None:  # else the guard has notified, or the operator knows
+        if stop.reason is None:  # else the guard has notified, or the operator knows
             await _tell_failure(assembly, directory.name, error)
         if isinstance(error, MemoryError):
             raise StandError(f"{directory}: {failure_text(error)}{_unsafe(assembly)}") from raised
@@ -519,4 +518,4 @@ class _Early:
 
 async def _finish(recorder: Recorder, recording: asyncio.Task[None], stop: Stop) -> None:
     await cancelled([recording])
-    await recorder.finish(COMPLETE_WITHIN_S if stop.fault is None else FINISH_WITHIN_S, stop.patience)
+    await recorder.finish(COMPLETE_WITHIN_S if stop.reason is None else FINISH_WITHIN_S, stop.patience)

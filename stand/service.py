@@ -181,9 +181,9 @@ class StandService(Served):
             changes.update(run.seen())
         elif daemon is not None and self._open_stand.guest is not None:
             changes["phase"] = "stopping" if daemon.orders.leaving else "running"
-        if (fault := (run and run.fault) or self._open_stand.latched) is not None:
-            since_ns = self._open_stand.fault_ns
-            changes["fault"] = FaultState(rule=fault.rule, text=fault.text, since_ns=since_ns, data=fault.data)
+        latch = self._open_stand.latch
+        if (fault := latch.fault) is not None:
+            changes["fault"] = FaultState(rule=fault.rule, text=fault.text, since_ns=latch.since_ns, data=fault.data)
         return seen_state(assembly.config, assembly.stand, self.hub, self.clock).model_copy(update=changes)
 
     def plan(self) -> tuple[PlanStep, ...]:
@@ -260,15 +260,15 @@ class StandService(Served):
     @command("/run/clear", has_verb=False)
     def clear(self, who: Who) -> str:
         """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
-        daemon, gate = self._daemon, self._assembly.stand.gate
-        if INTERLOCK not in gate.reasons and (daemon is None or not daemon.orders.queued.halted):
+        daemon, fault = self._daemon, self._open_stand.latch.fault
+        if fault is None and (daemon is None or not daemon.orders.queued.halted):
             raise Conflict(f"there is nothing to clear: no interlock holds this {'run' if daemon is None else 'stand'}")
-        gate.clear(INTERLOCK)
+        still = self._open_stand.clear()
         if daemon is not None:
             daemon.note()
-            if self._open_stand.latched is None:
+            if self._open_stand.latch.fault is None:
                 daemon.clear_queue()
-        return self._open_stand.cleared()
+        return f"cleared; {still}" if still else "cleared"
 
     @command("/run/skip")
     async def skip(self, who: Who, given: SkipRequest) -> str:
@@ -326,7 +326,7 @@ class StandService(Served):
         """Resume an interrupted run in its session; it is the next one."""
         if self._daemon is None:
             raise Conflict("a run has the stand; a session is resumed when it has ended")
-        if self._open_stand.latched is not None:
+        if self._open_stand.latch.fault is not None:
             raise Conflict("the stand has tripped; clear it first")
         entry = await self._daemon.orders.resume(given.session)
         self._daemon.wake()

@@ -22,6 +22,7 @@ from thermostand.stand.imaging.camera_supply import CameraSupply, SupplyLimits
 from thermostand.stand.imaging.cameras import Cameras
 from thermostand.stand.imaging.imaging import Imaging
 from thermostand.stand.interlock import Interlock, Motions
+from thermostand.stand.latch import Latch
 from thermostand.stand.safety import Safety
 from thermostand.stand.table.stages import Table
 
@@ -75,8 +76,9 @@ class Devices:
 
 
 class Stand:
-    """Its verbs are those of `chamber`, `imaging` and `table`. After a latched fault each but close_flap raises
-    StandTripped, while an interlock holds the gate Interlocked. `safety` is the one owner of making it safe."""
+    """Its verbs are those of `chamber`, `imaging` and `table`. While a run is being ended each but close_flap raises
+    StandTripped, while something is latched Interlocked. `latch` is the one answer to whether it has tripped, `safety`
+    the one owner of making it safe."""
 
     def __init__(self, devices: Devices, chamber: ChamberLimits, supply: SupplyLimits, hub: Hub, clock: Clock) -> None:
         self.devices = devices
@@ -85,7 +87,8 @@ class Stand:
         self.attended = False  # whether an operator does what is prompted for
         self._hub = hub
         self._clock = clock
-        self.interlock = interlock = Interlock(self.gate, (devices.flap, *devices.axes.values()))
+        self.latch = Latch(self.gate, hub, clock)
+        self.interlock = interlock = Interlock(self.latch, self.gate, (devices.flap, *devices.axes.values()))
         cameras = Cameras(devices.cameras)
         power = CameraSupply(cameras, devices.relays, supply, interlock, self.gate, hub, clock)
         self.imaging = Imaging(devices.cameras, devices.flap, power, interlock, self.gate, self.motions, hub, clock)

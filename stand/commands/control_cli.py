@@ -27,6 +27,7 @@ from thermostand.stand.commands.reached import (
 )
 from thermostand.stand.commands.sessions.session_text import size
 from thermostand.stand.gate import ENDINGS, HELD, INTERLOCK, STOPPING
+from thermostand.stand.latch import LatchedFault
 from thermostand.stand.service import held_text
 from thermostand.stand.serving.client import API, Answer, Server
 from thermostand.stand.serving.desk import FaultState, RunStatus, StandState
@@ -42,17 +43,26 @@ _NEW_NS = 10 * NS_PER_S  # slower than any installed stand polls
 
 
 @app.command()
-@on_stand(anywhere=True)
 def status(
-    server: Server,
+    directory: DirectoryArgument = None,
+    config: ConfigOption = "simulated",
+    url: UrlOption = "",
+    token_file: TokenOption = None,
     plan: Annotated[bool, typer.Option("--plan", help="The steps of the plan in force, and where they are.")] = False,
 ) -> None:
     """Show what the run under way is doing: step, state, expected end, temperatures, frames, disk, last warning.
 
-    Without DIR, when none runs in recording.directory: the only one on this machine. The same for `stand stop`.
+    Without DIR, when none runs in recording.directory: the only one on this machine. The same for `stand stop`. When
+    nothing runs: whether the stand of --config has tripped, and nobody has cleared it.
 
     Example: stand status /data/sessions
     """
+    try:
+        server = reached(directory, config, url, token_file, anywhere=True)
+    except SessionError as error:
+        if not url and directory is None and (fault := _left_latched(config)) is not None:
+            raise SessionError(f"{error}; the stand has tripped: {fault.text}; {ENDINGS[INTERLOCK]}") from error
+        raise
     if plan:
         _show_plan(server)
         return
@@ -127,18 +137,25 @@ def _held_again(server: Server) -> FaultState | None:
     return None
 
 
+def _left_latched(config: str) -> LatchedFault | None:
+    """What an earlier run or daemon has left latched of the stand, which no program has."""
+    from thermostand.stand.config.stand_config import load_config, packaged
+    from thermostand.stand.running.opening.claim import latch_file
+
+    return latch_file(load_config(packaged("", config))).read()
+
+
 def _cleared_here(config: str) -> bool:
     """Whether the stand, which no program has, was latched, and is so no longer; InUse when one has it."""
     import asyncio
 
     from thermostand.stand.config.stand_config import load_config, packaged
-    from thermostand.stand.running.opening.claim import claimed
-    from thermostand.stand.running.opening.stand_latch import StandLatch
+    from thermostand.stand.running.opening.claim import claimed, latch_file
 
     async def cleared() -> bool:
         stand = load_config(packaged("", config))
         async with claimed(stand, None, "stand clear"):
-            latch = await asyncio.to_thread(StandLatch.of, stand)
+            latch = await asyncio.to_thread(latch_file, stand)
             fault = await asyncio.to_thread(latch.read)
             if fault is not None:
                 await asyncio.to_thread(latch.clear)

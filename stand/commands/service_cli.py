@@ -17,7 +17,7 @@ from thermostand.foundation.files import write_whole
 from thermostand.foundation.output import say, show
 from thermostand.stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.running.opening.stand_latch import SYSTEM_FOLDER
+from thermostand.stand.latch import SYSTEM_FOLDER
 from thermostand.stand.serving.presence import STANDS_FOLDER
 
 app = App()

@@ -46,7 +46,6 @@ from thermostand.stand.daemon.daemon_file import Counters, Kept, KeptFile
 from thermostand.stand.daemon.day_record import DayRecord
 from thermostand.stand.estimating.learned import learn
 from thermostand.stand.fault import Fault
-from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.queueing.orders import Orders, said_of
 from thermostand.stand.queueing.queue_file import Entry
 from thermostand.stand.queueing.queue_work import Halt, Notes, Stopped, Watch, drain, interruption_of, is_complete
@@ -55,7 +54,6 @@ from thermostand.stand.running.course import keep
 from thermostand.stand.running.executing.settling_watch import load_for
 from thermostand.stand.running.guest import Guest, Job
 from thermostand.stand.running.opening.open_stand import OpenStand
-from thermostand.stand.running.opening.stand_latch import LatchedFault
 from thermostand.stand.running.opening.stop import STOPPED, Stop, catch_signals
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
 from thermostand.stand.running.resume import Interruption, repaired
@@ -83,7 +81,6 @@ class Daemon:
         record: DayRecord,
         kept: Kept,
         keep: KeptFile,
-        latched: LatchedFault | None = None,
         recorded: Callable[[Path], None] | None = None,
     ) -> None:
         assembly = open_stand.assembly
@@ -100,7 +97,6 @@ class Daemon:
         self._hub = hub
         self._clock = assembly.clock
         self._keep = keep
-        self._latched = latched  # by a program before this one
         self._recorded_whole = recorded  # is told of complete runs with frames
         self._status = systemd.Status()
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
@@ -178,8 +174,8 @@ class Daemon:
         """Why no device takes an order now, "" when they do."""
         if self.has_guest:
             return "a run has the stand; STOP ends it"
-        if self.open_stand.latched is not None:
-            return f"the stand has tripped: {self.open_stand.latched.text}; clear it once the cause is removed"
+        if self.open_stand.latch.fault is not None:
+            return f"the stand has tripped: {self.open_stand.latch.fault.text}; clear it once the cause is removed"
         reasons = self._assembly.stand.gate.reasons
         return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
 
@@ -214,11 +210,10 @@ class Daemon:
             stack.callback(self.note)  # written while the record is ended
             stack.callback(self.open_stand.patience.begin)
             stack.push_async_callback(self.open_stand.close)
+            await self.open_stand.latch.restore()
             self.open_stand.prepare()
             await self.open_stand.read_once()
             self.open_stand.start()
-            if (latch := self._latched) is not None:
-                self.open_stand.latch(Fault(latch.rule, latch.text, "hold"), latch.since_ns)
             self.open_stand.guard.look()
             catch_signals(self.leave)
             await watched(self._serve(front), self.open_stand.tasks)
@@ -244,7 +239,7 @@ class Daemon:
         begun, or waits for a disk after its end, is not waited for."""
         self.orders.leaving = True
         while self.orders.stop is not None and not worker.done():
-            if self.orders.stop.fault is None:  # once: another stop says that nobody wants to wait any more
+            if self.orders.stop.reason is None:  # once: another stop says that nobody wants to wait any more
                 self.orders.stop(_ENDS)
             await asyncio.wait([worker], timeout=_STOPPED_LOOK_S)
         if self._is_draining:
@@ -263,7 +258,7 @@ class Daemon:
             await self._wake.wait()
             self._wake.clear()
             queued = self.orders.queued
-            if self.open_stand.latched is not None or queued.halted or self.orders.leaving:
+            if self.open_stand.latch.fault is not None or queued.halted or self.orders.leaving:
                 continue
             if not any(entry.is_open for entry in queued.entries):
                 continue
@@ -283,11 +278,11 @@ class Daemon:
         """What an operator would do after the process that writes a run's session was killed: clear, and resume."""
         if self.orders.leaving or self._assembly.stand.safety.unconfirmed:
             return
-        if not self._restarts.may_follow(self.open_stand.latched, self._clock.now_ns()):
+        if not self._restarts.may_follow(self.open_stand.latch.fault, self._clock.now_ns()):
             return
-        self._assembly.stand.gate.clear(INTERLOCK)
+        self.open_stand.clear()
         self.note()
-        if self.open_stand.latched is not None:  # something else is wrong, too
+        if self.open_stand.latch.fault is not None:  # something else is wrong, too
             return
         try:
             await self.orders.read()
@@ -302,8 +297,8 @@ class Daemon:
     async def _run_one(self, entry: Entry, notes: Notes) -> Path:
         if self.orders.leaving:
             raise Interrupted("the daemon ends")
-        if self.open_stand.latched is not None:
-            raise StandTripped(f"the stand has tripped: {self.open_stand.latched.text}")
+        if self.open_stand.latch.fault is not None:
+            raise StandTripped(f"the stand has tripped: {self.open_stand.latch.fault.text}")
         has_begun = False
         self._run_id = entry.id
 

@@ -36,7 +36,6 @@ from thermostand.stand.queueing.orders import Orders
 from thermostand.stand.running.opening.claim import claimed
 from thermostand.stand.running.opening.clock_watch import ClockWatch
 from thermostand.stand.running.opening.open_stand import opened
-from thermostand.stand.running.opening.stand_latch import StandLatch
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.session_report import report_session
 from thermostand.stand.serving.alerts import alerting
@@ -117,7 +116,6 @@ async def serve(
         hub, clock = Hub(RepeatLimit()), WallClock()
         await asyncio.to_thread(make_folder, out)
         kept, damage = await asyncio.to_thread(kept_in, out)
-        latched = await asyncio.to_thread(StandLatch.of(config).read)
         watch = ClockWatch(hub, clock)
         assembly = assemble(config, hub, clock)
         assembly.notifier.start()
@@ -145,7 +143,6 @@ async def serve(
                     record,
                     kept,
                     keep,
-                    latched=latched,
                     recorded=reports.add if has_reports else None,
                 )
                 await daemon.serve(front)

@@ -18,6 +18,7 @@ from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.interlocks import NOT_RECORDED, Watch
 from thermostand.stand.guarding.met_errors import MetErrors
 from thermostand.stand.guarding.notify import Notifier
+from thermostand.stand.latch import Latch
 from thermostand.stand.safety import Safety
 
 _GUARD_FAILED = guard_rule("guard_failed", "the guard itself has failed")
@@ -26,20 +27,20 @@ _STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stoppe
 _ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more often needs an operator
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Guard:
     """Every `period_s` the rules.
 
     On a fault `stop(fault)` ends the run, or `hold(fault)` lets it wait; the trip is recorded, the stand is made safe,
-    and `notifier` runs. A hold stays until `clear`, but for one that ends by itself: `release()` is then called when no
-    rule objects any more and the stand has confirmed that it is safe, at most three times an hour. Without a `hold`
-    every trip aborts. A guard that fails aborts. One that `keeps_on` looks on after an abort, which it holds until
-    `clear`: that of a stand on which further runs follow.
+    and `notifier` runs. A hold stays until the latch is cleared, but for one that ends by itself: `release()`, which
+    clears it, is then called when no rule objects any more and the stand has confirmed that it is safe, at most three
+    times an hour. Without a `hold` every trip aborts. A guard that fails aborts. One that `keeps_on` looks on after an
+    abort, which stays latched: that of a stand on which further runs follow.
 
     met: device errors that steps have met, whose watches are among `watches`.
 
-    latch: gets each fault that only an operator ends before anything else is done or said of it; it waits for a disk
-    for a quarter of a second at most.
+    latch: gets each fault before anything else is done or said of it; it waits for a disk for a quarter of a second at
+    most.
 
     A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
     wait for a GOOD reading of each of `vital`, the channels that heat depends on, taken since. What is too old
@@ -47,6 +48,7 @@ class Guard:
     """
 
     safety: Safety
+    latch: Latch
     watches: tuple[Watch, ...]
     hub: Hub
     clock: Clock
@@ -59,8 +61,6 @@ class Guard:
     met: MetErrors = field(default_factory=lambda: MetErrors({}))
     vital: tuple[str, ...] = ()
     keeps_on: bool = False
-    latch: Callable[[Fault], None] = lambda _: None
-    held: Fault | None = None  # why the run waits
     _ended: bool = False
     _looked_ns: int | None = None
     _fresh_after_ns: int = 0
@@ -97,22 +97,25 @@ class Guard:
         return all(time_ns is not None and time_ns >= self._fresh_after_ns for time_ns in good_ns)
 
     @property
+    def held(self) -> Fault | None:
+        """What the stand was made safe for, and nobody has cleared."""
+        return self.latch.fault
+
+    @property
     def is_on_time(self) -> bool:
         """Whether it looks as often as it must."""
         now_ns, late_ns = self.clock.now_ns(), LATE_PERIODS * seconds_ns(self.period_s)
         return not self._ended and self._looked_ns is not None and now_ns - self._looked_ns <= late_ns
 
-    def clear(self) -> Fault | None:
-        """An operator has looked: the hold, which is returned, is forgotten, and every grace time begins again.
-        What is wrong still trips again, what has no grace time before anything moves. Continuing the run is the
-        caller's task."""
-        fault, self.held = self.held, None
+    def begin_again(self) -> None:
+        """The latch was cleared: every grace time begins again, and what was met is forgotten."""
         self.met.cleared()
         for watch in self.watches:
             watch.since_ns = None
-        if fault is not None:
-            self._follow_hold(self._faults())
-        return fault
+
+    def hold_again(self) -> None:
+        """What is wrong still holds again, what has no grace time before anything moves."""
+        self._follow_hold(self._faults())
 
     def still_wrong(self) -> str:
         """For who has just cleared: what holds the stand again, or will once it has lasted for its grace time; "" when
@@ -132,7 +135,6 @@ class Guard:
         fault = self.held
         if fault is None or fault.rule != NOT_RECORDED or not fault.ends_itself or self.release is None:
             return
-        self.held = None
         self.hub.publish(HOLD_ENDED.at(self.clock.now_ns(), fault.text, rule=fault.rule))
         self.release()
 
@@ -160,9 +162,9 @@ class Guard:
             await asyncio.wait(self._telling)
 
     def _abort(self, fault: Fault) -> None:
-        self.latch(fault)
+        if self.held is None or self.held.action != "abort":
+            self.latch.trip(fault)
         self._ended = not self.keeps_on
-        self.held = fault if self.keeps_on else self.held
         try:
             self.stop(fault)  # first: nothing moves any more that making safe would have to overtake
         finally:
@@ -182,9 +184,7 @@ class Guard:
     def _begin_hold(self, fault: Fault) -> None:
         if self.hold is None:
             return
-        if not fault.ends_itself:
-            self.latch(fault)
-        self.held = fault
+        self.latch.trip(fault)
         self.hold(fault)
         self._make_safe(fault)
 
@@ -197,13 +197,11 @@ class Guard:
                 f"{fault.text}; this has held the stand more than {_ENDINGS_PER_H} times in an hour, so it stays held: "
                 "`stand clear` continues"
             )
-            self.held = Fault(fault.rule, text, fault.action)
-            self.latch(self.held)
+            self.latch.trip(Fault(fault.rule, text, fault.action))
             self.hub.publish(HOLD_STAYS.at(now_ns, text, **data))
             self._notify(text)
             return
         self._endings_ns.append(now_ns)
-        self.held = None
         self.hub.publish(HOLD_ENDED.at(now_ns, fault.text, **data))
         self.release()
 

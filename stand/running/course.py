@@ -17,14 +17,13 @@ from thermostand.recording.writing.disk import DiskCalls
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.estimate import price
-from thermostand.stand.fault import Fault
 from thermostand.stand.gate import OPERATOR
 from thermostand.stand.running.executing.executor import Executor
 from thermostand.stand.running.memory.entries import edited
 from thermostand.stand.running.memory.fold import after, refusal
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.memory.state import RunState
-from thermostand.stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
+from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import plan_faults
 from thermostand.stand.running.status import STATES, StatusBoard
 from thermostand.stand.serving.desk import PlanCheck, PlanStep, PromptState, StepFault, StepStanding, Who, WrittenStep
@@ -149,12 +148,6 @@ class Course:
                 self._prompt = PromptState(step_id=self.log.state.under_way, text=item.text)
             case _:
                 pass
-
-    @property
-    def fault(self) -> Fault | None:
-        """What ends it; an operator who stops it is no fault."""
-        fault = self.stop.fault
-        return None if fault is None or fault.rule == STOPPED_BY_OPERATOR else fault
 
     def seen(self) -> dict[str, object]:
         """The fields of the stand's state that are a run's."""

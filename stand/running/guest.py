@@ -211,7 +211,7 @@ class Guest:
                 if isinstance(assembly.clock, VirtualClock):
                     limit_h = _VIRTUAL_PAUSES * assembly.config.guard.pause_limit_h
                     gate, clock = assembly.stand.gate, assembly.clock
-                    endless = end_endless_holds(gate, assembly.hub, clock, lambda: open_stand.latched, limit_h)
+                    endless = end_endless_holds(gate, assembly.hub, clock, open_stand.latch, limit_h)
                     watchers.append(asyncio.create_task(endless))
                 stop.started()
                 await watched(executor.run(), [*open_stand.tasks, recording, *watchers])
@@ -219,7 +219,7 @@ class Guest:
                 await watched(at_last, [*open_stand.tasks, recording, *watchers])
                 ended = Ended(0, "complete", "complete")
             except BaseException as error:
-                ended = _ending(stop.fault, error)
+                ended = _ending(stop.reason, error)
                 raise
             finally:
                 stop.taking_down()
@@ -256,8 +256,8 @@ class Guest:
             await self.job.begun(recorder.directory)
         gate, hub, clock = assembly.stand.gate, assembly.hub, assembly.clock
         gate.subscribe(log.held)
-        if open_stand.latched is not None:  # by the first look, when there was no journal yet
-            log.tripped(open_stand.latched)
+        if open_stand.latch.fault is not None:  # by the first look, when there was no journal yet
+            log.tripped(open_stand.latch.fault)
             log.held(INTERLOCK, True)
         holding = _hold_while_not_recorded(gate)
         hub.subscribe(holding)
@@ -298,9 +298,7 @@ class Guest:
         def soaked_again_s() -> float | None:
             return supply.equilibrium.soaked_s() if supply.is_on else None
 
-        board = StatusBoard(
-            name, night, kept, gate, self.stop, lambda: open_stand.latched, recorder, clock, soaked_again_s
-        )
+        board = StatusBoard(name, night, kept, gate, self.stop, open_stand.latch, recorder, clock, soaked_again_s)
         assembly.hub.subscribe(board)
         leaving.callback(assembly.hub.unsubscribe, board)
         if not isinstance(clock, VirtualClock):  # there nobody waits for the end

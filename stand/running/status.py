@@ -15,10 +15,10 @@ from thermostand.foundation.readings import Quality
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.stand.estimating.eta import Eta
 from thermostand.stand.estimating.run_estimate import Night
-from thermostand.stand.fault import Fault
 from thermostand.stand.gate import HELD, RELEASED, Gate, Phase
+from thermostand.stand.latch import Latch
 from thermostand.stand.running.memory.state import RunState
-from thermostand.stand.running.opening.stop import STOPPED_BY_OPERATOR, Stop
+from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.serving.desk import RunStatus
 
 # Says when the end of a run moves: an event each time it is later by another tenth of the whole.
@@ -64,7 +64,7 @@ STATES: dict[Phase, State] = {
 
 
 class StatusBoard:
-    """A subscriber of the hub that remembers what an operator asks for. `held` gives why the guard holds the run.
+    """A subscriber of the hub that remembers what an operator asks for. latch: whether the stand has tripped.
 
     eta: the time left, of the whole and of each step. soaked_again_s: for how long a camera that was off has been
     soaked again, None when it need not be.
@@ -77,7 +77,7 @@ class StatusBoard:
         state: RunState,
         gate: Gate,
         stop: Stop,
-        held: Callable[[], Fault | None],
+        latch: Latch,
         recorder: Recorder,
         clock: Clock,
         soaked_again_s: Callable[[], float | None] = lambda: None,
@@ -87,7 +87,7 @@ class StatusBoard:
         self.eta = Eta(night.steps, state.done, state.earned_s, night.after_s)
         self._gate = gate
         self._stop = stop
-        self._held = held
+        self._latch = latch
         self._recorder = recorder
         self._clock = clock
         self._step = 0
@@ -122,7 +122,7 @@ class StatusBoard:
         """As it is now."""
         self._follow_state()
         now_ns, saved = self._clock.now_ns(), self._recorder.saved
-        warning, fault = self._warning, self._fault()
+        warning, fault = self._warning, self._latch.fault
         return RunStatus(
             recipe=self._recipe,
             step=self._step,
@@ -156,11 +156,6 @@ class StatusBoard:
     def left_s(self, now_ns: int) -> float:
         """How long the run still takes, from now on."""
         return self.eta.left_s(now_ns)
-
-    def _fault(self) -> Fault | None:
-        """What has tripped; an operator who stops the run is no fault."""
-        fault = self._stop.fault or self._held()
-        return None if fault is None or fault.rule == STOPPED_BY_OPERATOR else fault
 
     def _follow_state(self) -> None:
         state = STATES[self._stop.phase]

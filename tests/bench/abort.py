@@ -130,7 +130,15 @@ async def _by_guard(stand: Stand, assembly: Assembly) -> float:
         async with Stop() as stop:
             stop.watch(stand)
             watches = (Watch(over_temperature("regulator.pv", -273.15)),)
-            guard = Guard(stand.safety, watches, assembly.hub, assembly.clock, 1.0, stop.trip)
+            guard = Guard(
+                safety=stand.safety,
+                latch=stand.latch,
+                watches=watches,
+                hub=assembly.hub,
+                clock=assembly.clock,
+                period_s=1.0,
+                stop=stop.trip,
+            )
             begun_s = time.perf_counter()
             watching.append(asyncio.create_task(guard.run()))
             await asyncio.Event().wait()

@@ -8,9 +8,11 @@ from thermostand.foundation.errors import DeviceFault
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.fault import Fault, Readings
+from thermostand.stand.gate import Gate
 from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import Rule, Watch
 from thermostand.stand.guarding.notify import Notifier
+from thermostand.stand.latch import Latch, LatchFile
 from thermostand.stand.safety import Safety
 
 
@@ -28,6 +30,18 @@ class PlainActuator:
         self.log.append("safe")
         if self.failure:
             raise DeviceFault(self.name, self.failure)
+
+
+class NotedFile(LatchFile):
+    """Writes down what is kept."""
+
+    def __init__(self, log: list[str]) -> None:
+        super().__init__(())
+        self.log = log
+
+    def keep(self, fault: Fault, since_ns: int) -> str:
+        self.log.append(f"latch {fault.rule}")
+        return ""
 
 
 NOTIFIERS: list[Notifier] = []  # of the test
@@ -58,17 +72,30 @@ class Bench:
         stop, hold = (lambda fault, name=name: self.log.append(f"{name} {fault.rule}") for name in ("stop", "hold"))
         notifier = Notifier(command, limit_s, self.clock)
         NOTIFIERS.append(notifier)
+        self.latch = Latch(Gate(), hub, self.clock)
         self.guard = Guard(
-            self.safety,
-            watches,
-            hub,
-            self.clock,
-            1.0,
-            stop,
-            hold if can_hold else None,
-            lambda: self.log.append("release"),
+            safety=self.safety,
+            latch=self.latch,
+            watches=watches,
+            hub=hub,
+            clock=self.clock,
+            period_s=1.0,
+            stop=stop,
+            hold=hold if can_hold else None,
+            release=self._release,
             notifier=notifier,
         )
+
+    def clear(self) -> None:
+        """As an operator does."""
+        if self.latch.fault is not None:
+            self.latch.clear()
+            self.guard.begin_again()
+            self.guard.hold_again()
+
+    def _release(self) -> None:
+        self.log.append("release")
+        self.latch.clear()
 
     def _rule(self, index: int) -> Rule:
         def rule(readings: Readings, now_ns: int) -> Fault | None:

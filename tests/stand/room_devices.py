@@ -20,6 +20,8 @@ from thermostand.foundation.readings import Frame, Quality, Reading
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import COMPRESSOR, HEATER, PermitLimits
 from thermostand.stand.config.stand_config import CompressorConfig
+from thermostand.stand.fault import Fault
+from thermostand.stand.gate import STOPPING
 from thermostand.stand.imaging.camera_supply import SupplyLimits
 from thermostand.stand.stand import Devices, Stand
 
@@ -206,3 +208,9 @@ async def rooms(K_per_min: float = math.inf) -> AsyncIterator[Rooms]:
     finally:
         await here.stand.safety.close()
         time.cancel()
+
+
+def trip(stand: Stand, fault: Fault) -> None:
+    """As the guard ends a run."""
+    stand.latch.trip(fault)
+    stand.gate.hold(STOPPING)

@@ -4,7 +4,6 @@ from typing import Protocol
 
 from tests.stand.small_stand import SmallStand
 from thermostand.foundation.readings import Frame
-from thermostand.stand.fault import Fault
 from thermostand.stand.gate import Gate
 from thermostand.stand.imaging.equilibrium import CameraEquilibrium
 from thermostand.stand.safety import Safety
@@ -60,12 +59,6 @@ class RunTable(Protocol):
     async def check_home(self, axis: str) -> None: ...
 
 
-class RunInterlock(Protocol):
-    """What the guard has found."""
-
-    def latch(self, fault: Fault, /) -> None: ...
-
-
 class RunStand(Protocol):
     """The whole."""
 
@@ -74,9 +67,6 @@ class RunStand(Protocol):
 
     @property
     def safety(self) -> Safety: ...
-
-    @property
-    def interlock(self) -> RunInterlock: ...
 
     @property
     def chamber(self) -> RunChamber: ...

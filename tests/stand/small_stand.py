@@ -45,14 +45,13 @@ class SmallStand:
 
     def __init__(self, clock, hub, wrong):
         self.gate = Gate()
-        self.chamber = self.imaging = self.supply = self.table = self.interlock = self
+        self.chamber = self.imaging = self.supply = self.table = self
         limits = EquilibriumSettings().model_copy(
             update={"time_constant_s": TIME_CONSTANT_S}
         )  # shorter than any camera's
         self.equilibrium = CameraEquilibrium(limits, hub, clock)
         self.safety = Safety(lambda: None, hub, clock)
         self.safety.take(self)
-        self.fault = None
         self.name = "stand"
         self.supplied, self.supplied_ns = True, None
         self.safe = self.heating = self.flap_open = self.broken = self.unconfirmed = False
@@ -61,10 +60,6 @@ class SmallStand:
         self.started_at_degC = None  # what the chamber was at when it was last set going, None after a new set-point
         self.set_ns = 0  # when that was
         self._clock, self._hub, self._wrong = clock, hub, wrong
-
-    def latch(self, fault):
-        self.fault = self.fault or fault
-        self.gate.hold(STOPPING)
 
     async def _act(self, what):
         if self.gate.reasons - {CAMERA_LOST, INTERLOCK, STOPPING}:
@@ -75,8 +70,8 @@ class SmallStand:
         self._check()
 
     def _check(self):
-        if self.fault is not None:
-            raise StandTripped("latched")
+        if STOPPING in self.gate.reasons:
+            raise StandTripped("ended")
         if INTERLOCK in self.gate.reasons:
             raise Interlocked("held")
         if self.broken:

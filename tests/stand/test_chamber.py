@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from tests.stand.room_devices import rooms
+from tests.stand.room_devices import rooms, trip
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.errors import ConfigError, DeviceFault, GarbledReply, Occupied, StandTripped, Unreachable
 from thermostand.foundation.readings import Reading
@@ -12,7 +12,6 @@ from thermostand.foundation.tasks import cancelled
 from thermostand.stand.chamber.chamber import Ordered
 from thermostand.stand.chamber.permits import HEATER
 from thermostand.stand.fault import Fault
-from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.interlock import Interlocked
 
 
@@ -80,7 +79,7 @@ async def test_a_fault_between_set_point_and_permission_leaves_no_heat():
     async with rooms() as here:
         starting = asyncio.create_task(here.stand.chamber.start(45.0))
         await here.passes(0.5)
-        here.stand.interlock.latch(Fault("air_hot", "the air is too hot"))
+        trip(here.stand, Fault("air_hot", "the air is too hot"))
         with pytest.raises(StandTripped, match="the air is too hot"):
             await starting
         assert here.calls == ["regulator sp 45"]
@@ -91,7 +90,8 @@ async def test_an_interlock_while_the_relay_is_armed_keeps_the_regulator_from_ru
     async with rooms() as here:
         starting = asyncio.create_task(here.stand.chamber.start(45.0))
         await here.passes(1.5)
-        here.stand.gate.hold(INTERLOCK)
+        here.stand.latch.trip(Fault("air_hot", "the air is too hot"))
+        here.stand.latch.bar()
         here.stand.safety.demand()
         with pytest.raises(Interlocked):
             await starting
@@ -155,7 +155,7 @@ async def test_a_set_point_on_its_way_goes_no_further_when_the_stand_trips():
     async with rooms(K_per_min=1.0) as here:
         walking = asyncio.create_task(here.stand.chamber.start(60.0))
         await here.passes(45.0)
-        here.stand.interlock.latch(Fault("air_hot", "the air is too hot"))
+        trip(here.stand, Fault("air_hot", "the air is too hot"))
         with pytest.raises(StandTripped, match="the air is too hot"):
             await walking
         assert max(set_points(here.calls)) <= 25.5

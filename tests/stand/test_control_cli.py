@@ -15,12 +15,14 @@ from tests.asking import ask
 from tests.host import Host
 from tests.stand.a_desk import ADesk, served
 from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.commands.control_cli import status_lines
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.estimating.run_estimate import Night
 from thermostand.stand.gate import Gate
+from thermostand.stand.latch import Latch
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.status import StatusBoard
@@ -110,7 +112,7 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
     host, gate = Host(), Gate()
     clock = host.clock()
     recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
-    board = StatusBoard("night", Night(()), RunState(()), gate, Stop(), lambda: None, recorder, clock)
+    board = StatusBoard("night", Night(()), RunState(()), gate, Stop(), Latch(gate, Hub(), clock), recorder, clock)
     host.step(3600)
     board(Event(clock.now_ns(), "warning", "odd", "it is so"))
     host.step(-60)
@@ -122,9 +124,17 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
 def test_the_board_says_that_a_camera_soaks_again_and_for_how_long():
     recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
     soaked: list[float | None] = [720.0, None]
-    clock = Host().clock()
+    clock, gate = Host().clock(), Gate()
     board = StatusBoard(
-        "night", Night(()), RunState(()), Gate(), Stop(), lambda: None, recorder, clock, lambda: soaked.pop(0)
+        "night",
+        Night(()),
+        RunState(()),
+        gate,
+        Stop(),
+        Latch(gate, Hub(), clock),
+        recorder,
+        clock,
+        lambda: soaked.pop(0),
     )
     assert board.status().doing == "the camera was or may have been off and soaks again, for 12 min so far"
     assert board.status().doing == ""

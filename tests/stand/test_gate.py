@@ -26,16 +26,6 @@ def test_the_gate_is_open_exactly_when_no_reason_is_left_and_no_reason_clears_an
         assert reported == expected
 
 
-def test_the_last_listener_hears_of_a_change_after_all_others_and_stays_when_a_run_has_gone():
-    gate, reported = Gate(), []
-    gate.subscribe_last(lambda reason, held: reported.append("last"))
-    gate.subscribe(lambda reason, held: reported.append("run"))
-    gate.hold("interlock")
-    gate.let_go()
-    gate.clear("interlock")
-    assert reported == ["run", "last", "last"]
-
-
 async def test_a_waiting_step_passes_when_the_last_reason_goes():
     gate = Gate()
     await gate.passed()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.stand.guard_bench import NOTIFIERS, Bench
+from tests.stand.guard_bench import NOTIFIERS, Bench, NotedFile
 from thermostand.foundation.clock import VirtualClock, WallClock, block_until, seconds_ns
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading
@@ -55,7 +55,7 @@ async def test_what_is_still_wrong_when_it_is_cleared_holds_before_anything_can_
     bench = Bench("hold")
     bench.objecting = {0}
     await bench.run_for(2)
-    bench.guard.clear()
+    bench.clear()
     assert bench.guard.held == Fault("rule0", "it is so", "hold")
     assert "it is so" in bench.guard.still_wrong()
     assert bench.log == ["hold rule0", "revoke", "safe", "hold rule0", "revoke"]
@@ -201,17 +201,17 @@ async def test_a_hold_that_ends_by_itself_ends_when_the_stand_is_safe_and_nothin
     assert bench.guard.held.text.startswith("it is so; this has held the stand more than 3 times in an hour")
     await bench.run_for(7200)
     assert bench.log.count("release") == 3
-    bench.guard.clear()
+    bench.clear()
     assert bench.guard.held is None
 
 
 async def test_a_hold_for_the_disk_ends_with_the_recording_and_is_not_reported_as_over():
     bench = Bench("hold")
     bench.guard.recording_ended()  # nothing is held
-    bench.guard.held = Fault("not_recorded", "3 s are not on the disk", "hold")
+    bench.latch.trip(held := Fault("not_recorded", "3 s are not on the disk", "hold"))
     bench.guard.recording_ended()
     assert bench.guard.held is not None  # for an operator
-    bench.guard.held = replace(bench.guard.held, ends_itself=True)
+    bench.latch.trip(replace(held, ends_itself=True))
     bench.guard.recording_ended()
     assert (bench.guard.held, bench.log) == (None, ["release"])
     (ended,) = bench.events
@@ -240,12 +240,12 @@ async def test_only_an_operator_clears_a_hold_and_what_is_still_wrong_trips_agai
     assert bench.guard.held is not None
     assert not bench.guard.may_permit()
     assert bench.log == ["hold rule0", "revoke", "safe"]
-    assert bench.guard.clear() == Fault("rule0", "it is so", "hold")
+    bench.clear()
     await bench.run_for(1)
     assert bench.guard.may_permit()
     bench.objecting = {0}
     await bench.run_for(2)
-    bench.guard.clear()
+    bench.clear()
     await bench.run_for(2)
     assert bench.log == ["hold rule0", "revoke", "safe"] * 3
     assert [event.kind for event in bench.events] == ["guard.rule0"] * 3
@@ -257,14 +257,14 @@ async def test_clearing_restarts_the_grace_time_of_every_rule():
     watch.grace_s = 10.0
     bench.objecting = {0}
     await bench.run_for(8)
-    assert bench.guard.clear() is None
+    bench.guard.begin_again()
     assert "it is so" in bench.guard.still_wrong()
     await bench.run_for(8)
     assert bench.guard.held is None
     await bench.run_for(4)
     assert bench.guard.held is not None
     bench.objecting = set()
-    bench.guard.clear()
+    bench.clear()
     await bench.run_for(1)
     assert bench.guard.still_wrong() == ""
 
@@ -289,10 +289,10 @@ async def test_a_guard_that_keeps_on_looks_after_an_abort_which_stays_until_it_i
     assert bench.log == ["stop rule1", "revoke", "safe"]
     assert not bench.guard.may_permit()
     assert bench.guard.is_on_time
-    bench.guard.clear()
+    bench.clear()
     assert bench.guard.held == Fault("rule0", "it is so", "hold")  # still wrong: held again, before anything moves
     bench.objecting = set()
-    bench.guard.clear()
+    bench.clear()
     assert await bench.run_for(2)
     assert bench.guard.may_permit()
 
@@ -305,7 +305,7 @@ async def test_what_only_an_operator_ends_is_latched_before_anything_else_is_don
     ):
         bench = Bench(action)
         bench.guard.watches[0].ends_itself = ends_itself
-        bench.guard.latch = lambda fault, log=bench.log: log.append(f"latch {fault.rule}")
+        bench.latch.file = NotedFile(bench.log)
         bench.objecting = {0}
         assert bench.guard.look() is (action == "hold")
         assert bench.log == log

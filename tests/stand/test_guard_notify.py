@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.stand.guard_bench import NOTIFIERS, Bench
+from tests.stand.guard_bench import NOTIFIERS, Bench, NotedFile
 from thermostand.foundation.clock import WallClock
 from thermostand.stand.guarding.notify_process import run_command
 
@@ -62,8 +62,7 @@ async def test_a_hold_that_has_come_back_too_often_and_now_stays_is_told(tmp_pat
     reported = tmp_path / "reported"
     bench = Bench("hold", command=(script(f'echo "$1" >> {reported}'),))
     bench.guard.watches[0].ends_itself = True
-    latched: list[str] = []
-    bench.guard.latch = lambda fault: latched.append(fault.rule)
+    bench.latch.file = NotedFile(bench.log)
     for _ in range(4):
         bench.objecting = {0}
         await bench.run_for(2)
@@ -73,7 +72,7 @@ async def test_a_hold_that_has_come_back_too_often_and_now_stays_is_told(tmp_pat
     assert told[:4] == ["it is so"] * 4
     assert len(told) == 5
     assert "more than 3 times in an hour, so it stays held" in told[4]
-    assert latched == ["rule0"]  # now it is for an operator
+    assert bench.log.count("latch rule0") == 1  # now it is for an operator
 
 
 async def test_a_run_that_is_taken_down_waits_until_somebody_was_notified(tmp_path: Path, script: Callable[[str], str]):

@@ -5,13 +5,13 @@ from typing import Any, cast
 
 import pytest
 
-from tests.stand.room_devices import Camera, Rooms, rooms
+from tests.stand.room_devices import Camera, Rooms, rooms, trip
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import StandTripped, Unreachable
 from thermostand.foundation.readings import Frame
 from thermostand.stand.fault import Fault
-from thermostand.stand.gate import CAMERA_LOST, INTERLOCK
+from thermostand.stand.gate import CAMERA_LOST
 from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S
 from thermostand.stand.interlock import Interlocked
 
@@ -98,7 +98,7 @@ async def test_a_look_opens_the_flap_for_its_frame_only_also_when_the_camera_is_
 
 async def test_after_a_trip_the_flap_closes_and_does_not_open():
     async with rooms() as here:
-        here.stand.interlock.latch(Fault("air_hot", "the air is too hot"))
+        trip(here.stand, Fault("air_hot", "the air is too hot"))
         with pytest.raises(StandTripped):
             await here.stand.imaging.open_flap()
         await here.stand.imaging.close_flap()
@@ -152,7 +152,8 @@ async def test_a_supply_that_dropped_is_restored_with_the_gate_held():
 async def test_a_supply_that_was_cut_goes_off_with_every_demand_and_is_confirmed():
     async with rooms() as here:
         await with_camera(here)
-        here.stand.gate.hold(INTERLOCK)
+        here.stand.latch.trip(Fault("air_hot", "the air is too hot"))
+        here.stand.latch.bar()
         here.stand.cut_camera()
         assert not here.stand.imaging.supply.is_on
         assert await here.stand.safety.confirmed(60)
@@ -161,7 +162,7 @@ async def test_a_supply_that_was_cut_goes_off_with_every_demand_and_is_confirmed
             await here.stand.imaging.supply.switch_on()
         here.stand.cut_camera()
         assert await here.stand.safety.confirmed(60)
-        here.stand.gate.clear(INTERLOCK)
+        here.stand.latch.clear()
         here.stand.safety.forgive()
         await here.stand.imaging.supply.switch_on()
         here.calls.clear()

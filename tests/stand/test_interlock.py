@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.errors import StandTripped
+from thermostand.foundation.hub import Hub
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import INTERLOCK, OPERATOR, STOPPING, Gate
 from thermostand.stand.interlock import Interlock, Interlocked, Motions
+from thermostand.stand.latch import Latch
 
 
 class Counted:
@@ -19,33 +22,24 @@ class Counted:
         self.times += 1
 
 
-def test_nothing_may_move_from_the_first_fault_on_until_the_run_that_it_ends_is_over():
+def test_nothing_may_move_while_a_run_is_ended_or_something_is_latched_and_a_pause_bars_nothing():
     gate, mover = Gate(), Counted()
-    interlock = Interlock(gate, (mover,))
-    interlock.check()
-    assert mover.times == 1
-    interlock.latch(Fault("air_hot", "the air is too hot"))
-    interlock.latch(Fault("late", "nobody looks"))
-    assert interlock.fault == Fault("air_hot", "the air is too hot")
-    assert gate.reasons == {STOPPING}  # nothing earns time meanwhile
-    with pytest.raises(StandTripped, match="the air is too hot"):
-        interlock.check()
-    assert mover.times == 1
-    interlock.unlatch()
-    assert gate.reasons == set()
-    interlock.check()
-    assert mover.times == 2
-
-
-def test_a_hold_of_the_guard_bars_movement_and_a_pause_does_not():
-    gate, mover = Gate(), Counted()
-    interlock = Interlock(gate, (mover,))
+    latch = Latch(gate, Hub(), VirtualClock(0))
+    interlock = Interlock(latch, gate, (mover,))
     gate.hold(OPERATOR)
     interlock.check()
-    gate.hold(INTERLOCK)
-    with pytest.raises(Interlocked):
+    latch.trip(Fault("air_hot", "the air is too hot"))
+    with pytest.raises(Interlocked, match="the air is too hot"):
         interlock.check()
-    gate.clear(INTERLOCK)
+    gate.hold(STOPPING)
+    with pytest.raises(StandTripped, match="the air is too hot") as ended:
+        interlock.check()
+    assert not isinstance(ended.value, Interlocked)  # which a step would wait for
+    gate.clear(STOPPING)
+    latch.bar()
+    assert gate.reasons == {OPERATOR, INTERLOCK}
+    latch.clear()
+    assert gate.reasons == {OPERATOR}
     interlock.check()
     assert mover.times == 2
 

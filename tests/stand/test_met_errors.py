@@ -66,14 +66,14 @@ async def test_each_error_holds_at_once_by_its_rule_and_ends_as_that_does(
     read(bench, error.device)
     await bench.run_for(3)
     assert (bench.guard.held is None) is ends_itself
-    bench.guard.clear()
+    bench.clear()
     assert bench.guard.held is None
 
 
 async def test_what_does_not_answer_yet_holds_again_at_once_when_it_is_cleared():
     bench = bench_of("hold")
     bench.guard.meet(Unreachable("flap", "gone"))
-    bench.guard.clear()
+    bench.clear()
     assert bench.log == ["hold device_lost", "revoke", "hold device_lost", "revoke"]
 
 

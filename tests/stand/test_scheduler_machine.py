@@ -195,13 +195,13 @@ class RunMachine(RuleBasedStateMachine):
     def camera_is_lost(self, duration_s):
         self.life.stand.camera_back_ns = self.life.clock.now_ns() + seconds_ns(duration_s)
 
-    @precondition(lambda self: not self.life.run.done() and self.life.stand.fault is None)
+    @precondition(lambda self: not self.life.run.done() and STOPPING not in self.life.stand.gate.reasons)
     @rule(unconfirmed=st.booleans())
     def interlock(self, unconfirmed):
         self.holding.add(INTERLOCK)
         self.life.interlock(unconfirmed)
 
-    @precondition(lambda self: not self.life.run.done() and self.life.stand.fault is None)
+    @precondition(lambda self: not self.life.run.done() and STOPPING not in self.life.stand.gate.reasons)
     @rule(
         duration_s=st.sampled_from([0.0, 5.0, 90.0]),
         pv_degC=st.sampled_from([24.0, 26.0, 30.0]),

@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.running.opening.stand_latch import SYSTEM_FOLDER
+from thermostand.stand.latch import SYSTEM_FOLDER
 from thermostand.stand.serving.presence import STANDS_FOLDER
 
 CONFIG = packaged("", "simulated")

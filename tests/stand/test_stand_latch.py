@@ -11,7 +11,8 @@ from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import SessionError
 from thermostand.stand.config.stand_config import StandConfig, packaged
 from thermostand.stand.fault import Fault
-from thermostand.stand.running.opening.stand_latch import UNREADABLE, WITHIN_S, StandLatch, state_folder
+from thermostand.stand.latch import UNREADABLE, WITHIN_S, LatchFile, state_folder
+from thermostand.stand.running.opening.claim import latch_file
 
 FAULT = Fault("over_temperature", "thermometers.air is 61.00 degC")
 
@@ -22,18 +23,18 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_what_was_kept_is_found_by_another_program_until_it_is_cleared(path: Path):
-    assert StandLatch([path]).read() is None
-    assert StandLatch([path]).keep(FAULT, 5) == ""
-    found = StandLatch([path]).read()
+    assert LatchFile([path]).read() is None
+    assert LatchFile([path]).keep(FAULT, 5) == ""
+    found = LatchFile([path]).read()
     assert found is not None
     assert (found.rule, found.text, found.since_ns) == (FAULT.rule, FAULT.text, 5)
-    assert StandLatch([path]).forget() == ""
-    assert StandLatch([path]).read() is None
-    StandLatch([path]).clear()
+    assert LatchFile([path]).forget() == ""
+    assert LatchFile([path]).read() is None
+    LatchFile([path]).clear()
 
 
 def whole(path: Path) -> bytes:
-    StandLatch([path]).keep(FAULT, 5)
+    LatchFile([path]).keep(FAULT, 5)
     return path.read_bytes()
 
 
@@ -77,23 +78,23 @@ SPOILT = [halved, zeroed, nulled, of_an_earlier_fault, emptied, linked, made_a_f
 def test_one_that_cannot_be_read_counts_as_latched_and_can_be_cleared(path: Path, spoil: Callable[[Path], None]):
     path.parent.mkdir()
     spoil(path)
-    found = StandLatch([path]).read()
+    found = LatchFile([path]).read()
     assert found is not None
     assert found.rule == UNREADABLE
     assert str(path) in found.text
-    StandLatch([path]).clear()
-    assert StandLatch([path]).read() is None
+    LatchFile([path]).clear()
+    assert LatchFile([path]).read() is None
 
 
 def test_one_that_cannot_be_cleared_stays_and_is_named(path: Path):
     path.mkdir(parents=True)
     (path / "something").touch()
     with pytest.raises(SessionError, match="the stand stays latched"):
-        StandLatch([path]).clear()
+        LatchFile([path]).clear()
 
 
 def test_a_disk_that_hangs_keeps_the_guard_waiting_for_a_moment_only(path: Path):
-    latch, hanging = StandLatch([path]), threading.Event()
+    latch, hanging = LatchFile([path]), threading.Event()
     latch.run = lambda *_: hanging.wait()
     assert WITHIN_S <= 0.25
     assert latch.keep(FAULT, 5) == "the disk has not answered"
@@ -101,22 +102,22 @@ def test_a_disk_that_hangs_keeps_the_guard_waiting_for_a_moment_only(path: Path)
 
 
 def test_a_process_that_has_ended_is_done_without(path: Path):
-    latch = StandLatch([path])
+    latch = LatchFile([path])
 
     def ended(*_: object) -> object:
         raise BrokenPipeError(32, "the process that writes the session to the disk has ended")
 
     latch.run = ended
     assert latch.keep(FAULT, 5) == ""
-    assert StandLatch([path]).read() is not None
+    assert LatchFile([path]).read() is not None
 
 
 def test_it_belongs_to_what_heats_and_not_to_a_name_or_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     data = yaml.safe_load(packaged("", "simulated").read_text())
 
-    def of(**changes: object) -> StandLatch:
-        return StandLatch.of(parse_document(yaml.safe_dump(data | changes), StandConfig, "stand.yaml"))
+    def of(**changes: object) -> LatchFile:
+        return latch_file(parse_document(yaml.safe_dump(data | changes), StandConfig, "stand.yaml"))
 
     assert of().keep(FAULT, 5) == ""
     assert of(name="another", recording={"directory": "/elsewhere"}).read() is not None

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from tests.stand.room_devices import rooms
+from tests.stand.room_devices import rooms, trip
 from thermostand.foundation.errors import ConfigError, StandTripped, Unreachable
 from thermostand.stand.fault import Fault
 
@@ -36,7 +36,7 @@ async def test_a_fault_while_a_stage_homes_keeps_it_from_the_move():
         here.linear.has_scale = False
         moving = asyncio.create_task(here.stand.table.move_to("linear", 25.0))
         await here.passes(0.5)
-        here.stand.interlock.latch(Fault("door", "the door is open"))
+        trip(here.stand, Fault("door", "the door is open"))
         with pytest.raises(StandTripped):
             await moving
         assert here.calls == ["linear home"]

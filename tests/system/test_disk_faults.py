@@ -42,7 +42,7 @@ from thermostand.stand.fault import Fault
 from thermostand.stand.queueing import queue
 from thermostand.stand.running.memory.entries import Dwell, Ended, Held, Step, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
-from thermostand.stand.running.opening.stand_latch import StandLatch
+from thermostand.stand.running.opening.claim import latch_file
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.resume import begun, interruption
 
@@ -119,7 +119,7 @@ class Stand:
     def __init__(self, root: Path) -> None:
         self.root, self.sessions, self.tokens = root, root / "sessions", root / "tokens.yaml"
         self.order = load_order("demo", "simulated")
-        self.latch = StandLatch.of(load_config(packaged("", "simulated")))
+        self.latch = latch_file(load_config(packaged("", "simulated")))
         self.before = []
         self.sessions.mkdir(parents=True)
         for number in range(4):

@@ -23,7 +23,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
 from thermostand.stand.config.stand_config import CompressorConfig, packaged
-from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.fault import Fault
 from thermostand.stand.imaging.camera_supply import SupplyLimits
 from thermostand.stand.interlock import Interlocked
 from thermostand.stand.stand import Devices, Stand
@@ -191,14 +191,15 @@ async def test_a_trip_while_homed_is_answered_lets_no_move_of_the_plan_begin(ben
     """The stand asks whether the axis has its scale, and the guard holds it before the answer is there."""
     axis = await in_real_time(bench)
     stand, before = stand_with(axis, WallClock()), bench.tap.count("move")
-    trip = Trip(bench, axis, b"gets", hold=lambda: stand.gate.hold(INTERLOCK))
+    fault = Fault("stage_alarm", "linear has an alarm", "hold")
+    trip = Trip(bench, axis, b"gets", hold=lambda: stand.latch.trip(fault))
     with pytest.raises(Interlocked):
         await stand.table.move_to("linear", 5.0)
     await trip.made_safe[0]
     assert bench.tap.count("move") == before
     with pytest.raises(Superseded):  # a program that does not ask the stand
         await axis.move_to(5.0)
-    stand.gate.clear(INTERLOCK)
+    stand.latch.clear()
     move = asyncio.create_task(stand.table.move_to("linear", 25.0))
     while bench.tap.count("move") == before:
         await asyncio.sleep(0.01)

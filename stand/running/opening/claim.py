@@ -28,7 +28,10 @@ from thermostand.foundation.addresses import SerialPlace, place_of
 from thermostand.foundation.errors import InUse, SessionError
 from thermostand.foundation.lock_file import remove, take, try_lock
 from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.latch import LatchFile
 from thermostand.stand.serving.presence import STANDS_FOLDER, lock_folder, runtime_folder, runtime_folders
+
+_HEATING = ("bus", "regulator")  # of the addresses: two stands that share a camera are two stands
 
 
 class Address(NamedTuple):
@@ -54,6 +57,12 @@ def addresses(config: StandConfig) -> tuple[Address, ...]:
             elif how == "name" or config.simulation is None:
                 found.append(Address(name, text))
     return tuple(found)
+
+
+def latch_file(config: StandConfig) -> LatchFile:
+    """What is latched of the stand of a configuration; asks the name service, as `addresses`."""
+    places = sorted({each.place for each in addresses(config) if each.device in _HEATING})
+    return LatchFile.at(file_name(place.partition(" in net:")[0]) for place in places)
 
 
 def _places(address: str) -> Iterator[str]:

@@ -6,16 +6,14 @@ cold, and no equilibrium). And in virtual time, where no operator is there, a ho
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.errors import DeviceError, NotCleared, StandError
 from thermostand.foundation.events import COMMAND, FLAP_NOT_SHUT, FLAP_SHUT_IN_HOLD
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.tasks import first_of
-from thermostand.stand.fault import Fault
 from thermostand.stand.gate import STOPPING, Gate
+from thermostand.stand.latch import Latch
 from thermostand.stand.stand import Stand
 
 # Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.
@@ -56,10 +54,8 @@ async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
     return await first_of(gate.passed(), clock.sleep_until(clock.now_ns() + seconds_ns(duration_s))) == 0
 
 
-async def end_endless_holds(
-    gate: Gate, hub: Hub, clock: Clock, latched: Callable[[], Fault | None], limit_h: float
-) -> None:
-    """For virtual time, until cancelled. NotCleared when the hold `latched` needs an operator and no command came for
+async def end_endless_holds(gate: Gate, hub: Hub, clock: Clock, latch: Latch, limit_h: float) -> None:
+    """For virtual time, until cancelled. NotCleared when what is latched needs an operator and no command came for
     30 min, StandError when the gate has been closed for `limit_h` without interruption."""
     since_ns: int | None = None  # the gate has been closed
     waits_ns: int | None = None  # the hold has waited for an operator
@@ -78,7 +74,7 @@ async def end_endless_holds(
     try:
         while True:
             await gate.closed()
-            now_ns, fault = clock.now_ns(), latched()
+            now_ns, fault = clock.now_ns(), latch.fault
             since_ns = now_ns if since_ns is None else since_ns
             if fault is None or fault.ends_itself:
                 waits_ns = None

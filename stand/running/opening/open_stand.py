@@ -14,7 +14,6 @@ from typing import Protocol, TypeVar, cast
 from thermostand.drivers.devices.protocols import Actuator
 from thermostand.foundation.clock import VirtualClock, WallClock
 from thermostand.foundation.errors import DeviceFault, StandError, Unreachable
-from thermostand.foundation.events import LATCH_NOT_CLEARED, LATCH_NOT_KEPT
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.repeats import RepeatLimit
@@ -23,14 +22,13 @@ from thermostand.recording.writing.disk import FILES_LINE, LATCH_LINE, Disk
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.fault import Fault
-from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR
+from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, NOT_RECORDED, OPERATOR, STOPPING
 from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import Recording
 from thermostand.stand.guarding.rules import Announcements
 from thermostand.stand.poller import Poller
-from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.opening.claim import claimed, latch_file
 from thermostand.stand.running.opening.holds import keep_shut_in_holds
-from thermostand.stand.running.opening.stand_latch import StandLatch
 from thermostand.stand.running.opening.stop import Stop
 
 _OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
@@ -68,21 +66,20 @@ class Guest(Protocol):
 class OpenStand:
     """The open stand. `recorder` is what heat depends on; set it before `prepare`.
 
-    is_for_one: it is closed with its one guest; else a trip is kept until an operator clears it (`latched`), guest or
-    not. background: tasks that must not end, from the opening on. patience: with the disk, when the last guest has
-    left and the stand is safe.
+    is_for_one: it is closed with its one guest; else a trip stays until an operator clears it, guest or not. latch:
+    whether the stand has tripped. background: tasks that must not end, from the opening on. patience: with the disk,
+    when the last guest has left and the stand is safe.
     """
 
     def __init__(self, assembly: Assembly, disk: Disk | None, patience: Patience, *, is_for_one: bool) -> None:
         self.assembly = assembly
+        self.latch = assembly.stand.latch
         self.disk = disk
         self.patience = patience
         self.is_for_one = is_for_one
         self.background: list[asyncio.Task[None]] = []
         self.recorder: Recorder | None = None
         self.guest: Guest | None = None
-        self.fault_ns = 0  # when the last fault was found
-        self.kept: StandLatch | None = None  # what outlives this process; None in virtual time
         self._announced = Announcements()
         self._guard: Guard | None = None
         self._pollers: tuple[Poller, ...] = ()
@@ -95,19 +92,17 @@ class OpenStand:
             raise ValueError("a stand is guarded when it is prepared")
         return self._guard
 
-    @property
-    def latched(self) -> Fault | None:
-        """What the guard has made the stand safe for, and nobody has cleared."""
-        return None if self._guard is None else self._guard.held
-
-    def cleared(self) -> str:
-        """What an operator is told who has cleared the stand."""
-        still = "" if self._guard is None else self._guard.still_wrong()
-        return f"cleared; {still}" if still else "cleared"
+    def clear(self) -> str:
+        """An operator has removed the cause of what is latched: the gate is let go, and what is still wrong trips
+        again, which is returned in words; "" when nothing is wrong."""
+        if self.latch.fault is not None:
+            self._release()
+            self.guard.hold_again()
+        return "" if self._guard is None else self._guard.still_wrong()
 
     def is_well(self) -> bool:
         """Whether the guard looks as often as it must, and finds nothing."""
-        return self._guard is not None and self._guard.is_on_time and self._guard.held is None
+        return self._guard is not None and self._guard.is_on_time and self.latch.fault is None
 
     @property
     def tasks(self) -> tuple[asyncio.Task[None], ...]:
@@ -119,17 +114,15 @@ class OpenStand:
         if self._guard is not None:
             return
         self._pollers = self.assembly.pollers()
-        gate = self.assembly.stand.gate
         self._guard = self.assembly.guard(
             self._trip,
             self._hold,
-            lambda: gate.clear(INTERLOCK),
+            self._release,
             _Recorded(self),
             self._frames_are_due,
             self._announced,
         )
         self._guard.keeps_on = not self.is_for_one
-        self._guard.latch = self._keep
 
     async def read_once(self) -> None:
         """Every device is read and published now; DeviceError the first time, when one cannot be read."""
@@ -141,7 +134,6 @@ class OpenStand:
         if self._tasks:
             return
         stand, hub, clock = self.assembly.stand, self.assembly.hub, self.assembly.clock
-        stand.gate.subscribe_last(self._on_gate)
         works = [
             *(poller.run() for poller in self._pollers),
             self.guard.run(),
@@ -206,35 +198,21 @@ class OpenStand:
         if self.is_for_one:
             return
         stand = self.assembly.stand
-        if self.latched is not None:
-            stand.gate.hold(INTERLOCK)
-        stand.interlock.unlatch()
-        for reason in (OPERATOR, CAMERA_LOST, DISK_LOW, NOT_RECORDED):
+        self.latch.bar()
+        for reason in (STOPPING, OPERATOR, CAMERA_LOST, DISK_LOW, NOT_RECORDED):
             stand.gate.clear(reason)
         self._announced.forget()
         stand.table.forget()
         stand.safety.renew()
         stand.attended = False
 
-    def latch(self, fault: Fault, since_ns: int) -> None:
-        """A fault that a daemon before this one has left, and that nobody has cleared."""
-        self.guard.held, self.fault_ns = fault, since_ns
-        self.assembly.stand.gate.hold(INTERLOCK)
-
-    def _keep(self, fault: Fault) -> None:
-        """On the disk, before anything is said of it."""
-        if self.kept is not None and (failure := self.kept.keep(fault, self.assembly.clock.now_ns())):
-            self.assembly.hub.publish(LATCH_NOT_KEPT.at(self.assembly.clock.now_ns(), failure))
-
     def _trip(self, fault: Fault) -> None:
-        self.fault_ns = self.assembly.clock.now_ns()
         if self.guest is None:
             return self._hold(fault)
         return self.guest.trip(fault)
 
     def _hold(self, fault: Fault) -> None:
-        self.fault_ns = self.assembly.clock.now_ns()
-        self.assembly.stand.gate.hold(INTERLOCK)
+        self.latch.bar()
         if self.guest is not None:
             self.guest.hold(fault)
 
@@ -242,17 +220,14 @@ class OpenStand:
         """From the camera, which is powered."""
         return self.assembly.stand.imaging.supply.is_on and self.guest is not None and self.guest.frames_to_come
 
-    def _on_gate(self, reason: str, held: bool) -> None:
-        """An operator has cleared the interlock: the guard's hold is over. Of a folder that is lost another one is
-        made."""
-        if reason == INTERLOCK and not held:
-            self.assembly.stand.chamber.permits.forgive()
-            self.assembly.stand.safety.forgive()
-            if self.recorder is not None:
-                self.recorder.refound()
-            if self.kept is not None and (failure := self.kept.forget()):
-                self.assembly.hub.publish(LATCH_NOT_CLEARED.at(self.assembly.clock.now_ns(), failure))
-            self.guard.clear()
+    def _release(self) -> None:
+        """The guard's hold is over. Of a folder that is lost another one is made."""
+        self.latch.clear()
+        self.assembly.stand.chamber.permits.forgive()
+        self.assembly.stand.safety.forgive()
+        if self.recorder is not None:
+            self.recorder.refound()
+        self.guard.begin_again()
 
 
 class _Recorded:
@@ -285,13 +260,13 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
         disk = None if isinstance(assembly.clock, VirtualClock) else Disk()
         latch = None
         if disk is not None:
-            latch = await asyncio.to_thread(StandLatch.of, assembly.config)
+            latch = await asyncio.to_thread(latch_file, assembly.config)
             stack.push_async_callback(disk.ended_within, stop.patience)
             assembly.stand.chamber.compressor_file.through(disk.line(FILES_LINE).run)
             latch.run = disk.line(LATCH_LINE).run
         stack.push_async_callback(assembly.stand.chamber.compressor_file.close, stop.patience)
         open_stand = OpenStand(assembly, disk, stop.patience, is_for_one=is_for_one)
-        open_stand.kept = latch
+        assembly.stand.latch.file = latch
         stack.push_async_callback(cancelled, open_stand.background)
         if time is not None:
             open_stand.background.append(asyncio.create_task(time()))

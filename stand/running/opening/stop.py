@@ -9,7 +9,7 @@ from collections.abc import Callable
 from thermostand.foundation.errors import Interrupted, SessionError, StandTripped
 from thermostand.foundation.patience import Patience
 from thermostand.stand.fault import Fault
-from thermostand.stand.gate import Gate, Phase, Turn, next_phase
+from thermostand.stand.gate import STOPPING, Gate, Phase, Turn, next_phase
 from thermostand.stand.stand import Stand
 
 STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
@@ -20,17 +20,17 @@ class Stop:
     """The one way a run ends early, in any phase: `stop(fault)` for the operator (SIGINT, SIGTERM, SIGQUIT, and SIGHUP,
     when the terminal is closed and nohup does not keep it away), `stop.trip(fault)` for the guard.
 
-    The stand is latched and made safe, the run cancelled where it waits, once, and not while it is being taken down;
-    what it then raises becomes Interrupted or StandTripped with the first reason. While an actuator does not confirm
-    that it is safe, a signal a minute after the first ends the wait. Without `has_signals` the signals are somebody
-    else's: those of a daemon, whose guest is stopped.
+    Nothing moves from then on, the stand is made safe, the run cancelled where it waits, once, and not while it is
+    being taken down; what it then raises becomes Interrupted or StandTripped with the first reason. While an actuator
+    does not confirm that it is safe, a signal a minute after the first ends the wait. Without `has_signals` the signals
+    are somebody else's: those of a daemon, whose guest is stopped.
 
     patience: how long a disk is waited for once the stand is safe; a run that has ended by itself, and is stopped while
     it waits, has no more time than another.
     """
 
     def __init__(self, *, has_signals: bool = True) -> None:
-        self.fault: Fault | None = None
+        self.reason: Fault | None = None  # why the run ends, by the first stop
         self.phase = Phase.IDLE
         self.patience = Patience()
         self._stand: Stand | None = None
@@ -56,7 +56,7 @@ class Stop:
             self._follow(self._stand.gate)
 
     def __call__(self, fault: Fault = STOPPED) -> None:
-        """Latch at once, begin to make safe, and return; the run is cancelled when every actuator has been tried."""
+        """Bar motion at once, begin to make safe, and return; the run is cancelled when every actuator was tried."""
         if self._begins(fault) and self._stand is not None:
             self._stand.safety.demand()
 
@@ -65,10 +65,10 @@ class Stop:
         self._begins(fault)
 
     def _begins(self, fault: Fault) -> bool:
-        """Latch; whether this stop is the first."""
-        self.fault = self.fault or fault
+        """Nothing moves from now on; whether this stop is the first."""
+        self.reason = self.reason or fault
         if self._stand is not None:
-            self._stand.interlock.latch(fault)
+            self._stand.gate.hold(STOPPING)  # nothing earns time while the stand is being made safe
         if self.phase in (Phase.ABORTING, Phase.ENDING, Phase.ENDED):
             if self._stand is not None and fault.rule == STOPPED_BY_OPERATOR:
                 self._stand.safety.give_up()
@@ -95,7 +95,7 @@ class Stop:
     def ended(self) -> None:
         """The plan has ended, whichever way, and the stand is safe."""
         self._turn(Turn.END)
-        if self.fault is not None:
+        if self.reason is not None:
             self.patience.begin()
 
     async def _abort(self, stand: Stand) -> None:
@@ -124,15 +124,15 @@ class Stop:
     async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         for number in self._signals:
             asyncio.get_running_loop().remove_signal_handler(number)
-        if self.fault is None or error is None:
+        if self.reason is None or error is None:
             return
         unsafe = self._stand.safety.unconfirmed if self._stand is not None else ()
-        text = f"{self.fault.text}; " + (f"NOT SAFE: {'; '.join(unsafe)}" if unsafe else "the stand is safe")
+        text = f"{self.reason.text}; " + (f"NOT SAFE: {'; '.join(unsafe)}" if unsafe else "the stand is safe")
         if isinstance(error, SessionError):
             text = f"{text}; {error}"
         if isinstance(error, asyncio.CancelledError):
             self._run.uncancel()
-        raise (Interrupted(text) if self.fault.rule == STOPPED_BY_OPERATOR else StandTripped(text)) from error
+        raise (Interrupted(text) if self.reason.rule == STOPPED_BY_OPERATOR else StandTripped(text)) from error
 
 
 def catch_signals(leave: Callable[[], None]) -> None:
