@@ -17,6 +17,7 @@ from thermostand.recording.reading.notes import LONGEST_NOTE
 from thermostand.stand.gate import ENDINGS, INTERLOCK, OPERATOR, Phase
 from thermostand.stand.serving.commands import Served, Typed, command
 from thermostand.stand.serving.desk import (
+    LONGEST_RECIPE,
     Conflict,
     DeviceState,
     Done,
@@ -51,7 +52,7 @@ _NOTHING_RUNS = "nothing is run now"
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"
 _ENDING = (Phase.ABORTING, Phase.ENDING, Phase.ENDED)
 
-RunNumber = Annotated[int, Field(ge=1, le=1 << 53)]
+RunNumber = Annotated[int, Typed("id", "Its number in `stand queue list`."), Field(ge=1, le=1 << 53)]
 SessionName = Annotated[str, Field(max_length=255)]
 StepId = Annotated[str, Typed("step", help="Its number in `stand status --plan`, or its id."), Field(max_length=200)]
 
@@ -82,7 +83,20 @@ class ExtendRequest(Document):
 class SubmitRequest(RunRequest):
     """A run that is asked for. key: the caller's own word for it: asked again with it, nothing is queued twice."""
 
-    key: str = Field(default="", max_length=200)
+    recipe: Annotated[
+        str, Typed("recipe", "A recipe file, or the name of an installed one.", is_first=True, text_in="recipe_text")
+    ] = Field(default="", max_length=200)
+    recipe_text: Annotated[str, Typed("")] = Field(default="", max_length=LONGEST_RECIPE)
+    attended: Annotated[bool, Typed("attended", "A person will do what the plan's prompts ask for.")] = Field(
+        default=False, strict=True
+    )
+    tags: Annotated[tuple[Tag, ...], Typed("tag", "For the catalogue of sessions; may be given several times.")] = (
+        Field(default=(), max_length=32)
+    )
+    note: Annotated[str, Typed("note", "For the catalogue of sessions.")] = Field(default="", max_length=LONGEST_NOTE)
+    key: Annotated[str, Typed("key", "A name of your own for this order: the same name again queues nothing.")] = Field(
+        default="", max_length=200
+    )
 
 
 class CancelRequest(Document):
@@ -95,7 +109,7 @@ class MoveRequest(Document):
     """1 is the next to be run."""
 
     run: RunNumber
-    to: int = Field(ge=1, le=1_000_000)
+    to: Annotated[int, Typed("position", "1 is the next to be run.")] = Field(ge=1, le=1_000_000)
 
 
 class ResumeRequest(Document):
@@ -257,7 +271,7 @@ class StandService(Served):
         self._running().go_on()
         return held_text(self._assembly.stand.gate.reasons)
 
-    @command("/run/clear", has_verb=False)
+    @command("/run/clear", verbs=())
     def clear(self, who: Who) -> str:
         """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
         daemon, fault = self._daemon, self._open_stand.latch.fault
@@ -292,36 +306,48 @@ class StandService(Served):
         await _changed(run.executor.extend(step_id, given.by_s))
         return f"step {given.step_id} takes {given.by_s / 60.0:g} min longer"
 
-    @command("/run/plan", http="PUT", has_verb=False)
+    @command("/run/plan", http="PUT", verbs=())
     async def edit(self, who: Who, given: PlanRequest) -> str:
         """Replace the steps from a place on, none of which was begun. Durable when it is answered."""
         count = await self._running().edit(given.from_index, given.steps)
         return f"the steps from number {given.from_index + 1} on are replaced by {count} others"
 
-    @command("/queue", status=201, has_verb=False, by_secop="recipe")
+    @command("/queue", status=201, verbs=("submit", "queue add"), by_secop="recipe")
     async def submit(self, who: Who, given: SubmitRequest) -> QueuedRun:
-        """Check a run and queue it. With the key of an earlier one: that one; 409 when its request was another."""
+        """Check a run and queue it as it is now. Later edits of its file change nothing.
+
+        Recipe, limits, wires and the room on the disk are checked. With the key of an earlier run: that one, 409 when
+        its request was another.
+
+        Example: stand submit night.yaml --key monday
+        """
         daemon = self._queueing()
         order = RunRequest.model_validate(given.model_dump(exclude={"key"}))
         entry = await daemon.orders.submit(who, order, given.key)
         daemon.wake()
         return daemon.orders.shown_run(entry)
 
-    @command("/queue/{run}", http="DELETE", has_verb=False)
+    @command("/queue/{run}", http="DELETE", verbs=("queue remove",), title="Remove")
     async def cancel(self, who: Who, given: CancelRequest) -> str:
-        """Take a run out of the queue; what it has recorded stays."""
+        """Take a run out of the queue; what it has recorded stays.
+
+        Example: stand queue remove 5
+        """
         daemon = self._queueing()
         await daemon.orders.cancel(given.run)
         daemon.wake()
         return f"run {given.run} is out of the queue"
 
-    @command("/queue/{run}/move", has_verb=False)
+    @command("/queue/{run}/move", verbs=("queue move",))
     async def move(self, who: Who, given: MoveRequest) -> str:
-        """Change when a run has its turn."""
+        """Change when a run has its turn.
+
+        Example: stand queue move 5 1
+        """
         await self._queueing().orders.move(given.run, given.to)
         return f"run {given.run} has turn {given.to}"
 
-    @command("/sessions/{session}/resume", has_verb=False)
+    @command("/sessions/{session}/resume", verbs=())
     async def resume(self, who: Who, given: ResumeRequest) -> str:
         """Resume an interrupted run in its session; it is the next one."""
         if self._daemon is None:
@@ -332,7 +358,7 @@ class StandService(Served):
         self._daemon.wake()
         return f"run {entry.id} is resumed next"
 
-    @command("/devices/{device}/{verb}", has_verb=False)
+    @command("/devices/{device}/{verb}", verbs=())
     async def device(self, who: Who, given: DeviceRequest) -> str:
         """Tell a device something between runs, through the same gate as a run. What takes longer than a moment goes on
         when this is answered, and its failure is an event."""
@@ -342,7 +368,7 @@ class StandService(Served):
             raise Missing(f"this stand has no device of that name; there are {', '.join(kinds)}")
         raise Conflict("a run has the stand; pause does not change that, STOP ends the run")
 
-    @command("/sessions/{session}/notes", has_verb=False, by_secop=None)
+    @command("/sessions/{session}/notes", verbs=(), by_secop=None)
     async def note(self, who: Who, given: NoteRequest) -> str:
         """Add a note and tags to a session, running or finished."""
         from thermostand.stand.running.course import Said, keep
@@ -351,7 +377,7 @@ class StandService(Served):
         await keep(said, *await self._notes_of(given.session), self.hub, self.clock)
         return "noted"
 
-    @command("/simulator/faults", has_verb=False, by_secop=None)
+    @command("/simulator/faults", verbs=(), by_secop=None)
     async def fault(self, who: Who, given: FaultRequest) -> str:
         """Break something of the simulated laboratory on purpose, or mend it; 409 for a real stand."""
         from thermostand.stand.running.simulated_faults import break_or_mend

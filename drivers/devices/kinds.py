@@ -165,8 +165,7 @@ class DeviceKind:
     address_key: the setting that says where it answers, "" for a unit on the bus. stand_in: what is in its place on a
     stand without one, which is polled each stand_in_s, None for not at all. missing: what such a stand lacks. advise:
     what a person does about an error. check: what `stand check` looks at. verbs: what a person may tell it.
-    simulated_map: of a unit on the bus, the register map of the one in the simulated laboratory. asks_only: opening it
-    writes nothing.
+    simulated_map: of a unit on the bus, the register map of the one in the simulated laboratory.
     fakes: by what the simulated laboratory has it, one for each protocol; its section (the name of an added kind) by
     default, () for none.
     """
@@ -187,7 +186,6 @@ class DeviceKind:
     check: Callable[[DeviceLook], Coroutine[None, None, None]] = check_answers
     verbs: tuple[Verb, ...] = ()
     simulated_map: str = ""
-    asks_only: bool = True
     fakes: tuple[str, ...] | None = None
 
     def fake(self, settings: Any) -> str:

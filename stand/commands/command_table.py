@@ -23,9 +23,12 @@ def _verbs() -> dict[str, Lazy]:
     for method in (each for each in ast.walk(tree) if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)):
         for mark in (each for each in method.decorator_list if isinstance(each, ast.Call)):
             settings = {each.arg: ast.unparse(each.value) for each in mark.keywords}
-            if ast.unparse(mark.func) == "command" and settings.get("has_verb") != "False":
-                text = " ".join((ast.get_docstring(method) or "").split())
-                found[method.name.rstrip("_")] = Lazy(_VERBS, text.partition(". ")[0].rstrip(".") + ".")
+            if ast.unparse(mark.func) != "command":
+                continue
+            text = " ".join((ast.get_docstring(method) or "").split())
+            for verb in ast.literal_eval(settings.get("verbs", repr((method.name.rstrip("_"),)))):
+                if " " not in verb:  # else it stands behind another
+                    found[verb] = Lazy(_VERBS, text.partition(". ")[0].rstrip(".") + ".")
     return found
 
 
@@ -52,16 +55,13 @@ app = lazy_app(
             "thermostand.stand.commands.check_cli",
             "Check each device of a stand: connected, the right unit, its settings, a reading.",
         ),
-        "submit": Lazy(
-            "thermostand.stand.commands.order_cli", "Submit a recipe to the stand's daemon, which queues it."
-        ),
-        "device": Lazy("thermostand.stand.commands.order_cli", "Command one device by hand, between runs."),
+        "device": Lazy("thermostand.stand.commands.device_cli", "Command one device by hand, between runs."),
         "devices": Lazy("thermostand.stand.commands.devices_cli", "What is connected to this computer."),
         "init": Lazy("thermostand.stand.commands.init_cli", "Write the folder of a new stand, from what is connected."),
         "recipes": Lazy("thermostand.stand.commands.installed_cli", "List the installed recipes."),
         "configs": Lazy("thermostand.stand.commands.installed_cli", "List the installed configurations of stands."),
         "config": Lazy("thermostand.stand.commands.config_cli", "Configuration files: JSON Schemas for editors."),
-        "queue": Lazy("thermostand.stand.commands.queue_cli", "A queue of runs: add, list, move, remove, start."),
+        "queue": Lazy("thermostand.stand.commands.queue_cli", "The queue of a stand: add, list, move, remove."),
         "alert": Lazy("thermostand.stand.commands.alert_cli", "Alerts to people elsewhere: test them."),
         "token": Lazy("thermostand.stand.commands.token_cli", "Tokens for the network: add, list, remove, login."),
         "session": Lazy(

@@ -26,6 +26,7 @@ from thermostand.stand.commands.reached import (
     reached,
 )
 from thermostand.stand.commands.sessions.session_text import size
+from thermostand.stand.commands.verbs import order
 from thermostand.stand.gate import ENDINGS, HELD, INTERLOCK, STOPPING
 from thermostand.stand.latch import LatchedFault
 from thermostand.stand.service import held_text
@@ -114,7 +115,7 @@ def clear(
         if url or directory is not None or not _cleared_here(config):
             raise
         return
-    answer = server.order("clear")
+    answer = order(server, "clear")
     again, text = _held_again(server), str(answer.get("text") or "cleared")
     if again is not None:
         text = f"cleared; held again: {again.rule}: {again.text}"

@@ -48,11 +48,9 @@ def named_config(argument: str | None, option: str | None, default: str = "simul
     return argument or option or default
 
 
-def on_stand(
-    *, anywhere: bool = False, by_option: bool = False
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def on_stand(*, anywhere: bool = False) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A command whose first parameter is the Server it is for: what finds that is taken from the command line instead.
-    anywhere: as `reached` has it. by_option: the folder is an option, since the command has arguments of its own."""
+    anywhere: as `reached` has it."""
 
     def take(function: Command) -> Command:
         @functools.wraps(function)
@@ -61,7 +59,7 @@ def on_stand(
         ) -> None:
             function(reached(directory, config, url, token_file, anywhere=anywhere), *arguments, **options)
 
-        added = {"directory": (DirectoryOption if by_option else DirectoryArgument, None), **OPTIONS}
+        added = {"directory": (DirectoryArgument, None), **OPTIONS}
         return with_parameters(command, function, added, without="server")
 
     return take

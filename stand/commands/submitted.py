@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from urllib.parse import quote
 
 from pydantic import ValidationError
 
-from thermostand.foundation.documents import read_document
 from thermostand.foundation.errors import ConfigError, Interrupted, SessionError, StandError
+from thermostand.stand.commands.verbs import order, recipe_of
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.opening.claim import daemon_pid
 from thermostand.stand.running.order import Order
-from thermostand.stand.serving.client import API, Server
+from thermostand.stand.serving.client import Server
 from thermostand.stand.serving.desk import QueuedRun, StandState
 from thermostand.stand.serving.presence import living
 from thermostand.stand.watching.live import View, view
 from thermostand.stand.watching.moment import Moment, There
 
 _LOOK_S = 0.5
-_QUEUE_LIMIT_S = 60.0  # the wires of the stand are asked when a run is queued
 _LOST_LIMIT_S = 60.0  # a daemon that does not answer for so long is not followed any more
 _LEVELS = ("warning", "error")
 
@@ -35,23 +32,17 @@ def daemon_of(config: StandConfig) -> Server | None:
     return None if found is None else Server(found.entry.session, found.socket)
 
 
-def submit_recipe(server: Server, recipe: str, *, attended: bool = False, key: str = "") -> QueuedRun:
+def submit_recipe(server: Server, recipe: str, *, attended: bool = False) -> QueuedRun:
     """A file's recipe as it is now, or an installed one, checked and queued there; SessionError when the stand refuses
     it."""
-    body: dict[str, object] = {"attended": attended, "key": key}
-    path = Path(recipe)
-    if path.is_file():
-        body["recipe_text"] = read_document(path)
-    else:
-        body["recipe"] = recipe
-    return _queued(server, body)
+    return _queued(server, attended=attended, **recipe_of(recipe))
 
 
-def submit(server: Server, order: Order, out: Path | None) -> QueuedRun:
+def submit(server: Server, wanted: Order, out: Path | None) -> QueuedRun:
     """Checked and queued there; SessionError when the stand refuses it."""
     if out is not None and out.absolute() != Path(server.name):
         raise ConfigError(f"--out {out}: `stand serve` has this stand, and records to {server.name}")
-    return _queued(server, {"recipe_text": order.recipe_text, "attended": order.attended, "key": uuid.uuid4().hex})
+    return _queued(server, recipe_text=wanted.recipe_text, attended=wanted.attended, key=uuid.uuid4().hex)
 
 
 def submit_resumed(server: Server, session: Path) -> QueuedRun:
@@ -59,16 +50,16 @@ def submit_resumed(server: Server, session: Path) -> QueuedRun:
     session = session.resolve()
     if session.parent != Path(server.name).resolve():
         raise ConfigError(f"{session}: `stand serve` has this stand, and resumes what is in {server.name}")
-    server.request("POST", f"{API}/sessions/{quote(session.name)}/resume", None, _QUEUE_LIMIT_S)
+    order(server, "resume", session=session.name)
     found = [run for run in server.state().queue if run.session == session.name]
     if not found:
         raise SessionError(f"{session}: its run was taken out of the queue of `stand serve` meanwhile")
     return found[-1]
 
 
-def _queued(server: Server, body: Mapping[str, object]) -> QueuedRun:
+def _queued(server: Server, **given: object) -> QueuedRun:
     try:
-        return QueuedRun.model_validate(server.request("POST", f"{API}/queue", body, _QUEUE_LIMIT_S))
+        return QueuedRun.model_validate(order(server, "submit", **given))
     except ValidationError as error:
         raise SessionError(f"{server.name}: its daemon sent an unknown reply; is its version different?") from error
 
@@ -127,9 +118,9 @@ class _Follower:
         state = self._server.state()
         waits = any(run.id == self._run.id and run.state in self._to_come for run in state.queue)
         if waits:
-            self._server.request("DELETE", f"{API}/queue/{self._run.id}")
+            order(self._server, "cancel", run=self._run.id)
             raise Interrupted(f"run {self._run.id} was taken out of the queue; nothing was started")
-        self._server.order("stop")
+        order(self._server, "stop")
 
     def _waiting(self, state: StandState, moment: Moment) -> Moment:
         ahead = sum(each.state in ("waiting", "running", "interrupted") for each in state.queue) - 1

@@ -4,52 +4,87 @@ interface. Whatever they do, a program can do as well."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args, get_origin
 from urllib.parse import quote
 
 import typer
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from thermostand.foundation.command_app import App, with_parameters
+from thermostand.foundation.documents import read_document
 from thermostand.foundation.output import show
 from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.reached import OPTIONS, DirectoryArgument, reached
 from thermostand.stand.service import StandService
-from thermostand.stand.serving.client import API, Answer
+from thermostand.stand.serving.client import API, Answer, Server
 from thermostand.stand.serving.commands import STOP, Command, Served, Typed, commands_of
+from thermostand.stand.serving.desk import Done
 
 _LIMIT_S = 60.0  # what a command waits for: a device may move, or the stand's wires be asked
 
 
-def app_of(service: type[Served]) -> App:
-    """The command line of a service."""
-    app = App()
+def app_of(service: type[Served], group: str = "", help_text: str | None = None) -> App:
+    """The command line of a service, of the verbs that stand behind `group`, such as `queue`."""
+    app = App(help_text, no_args_is_help=bool(group))
     for each in commands_of(service).values():
-        if each.has_verb:
-            app.command(each.name)(_verb(each))
+        for words in (verb.split() for verb in each.verbs or ()):
+            if words[:-1] == group.split():
+                app.command(words[-1])(_verb(each))
     return app
 
 
+def ask(server: Server, command: Command, **given: object) -> Answer:
+    """What a stand answers to a command with these fields of its argument. SessionError as Server.request."""
+    if command.name == STOP:
+        return server.order(STOP)  # which has a way of its own
+    path = command.path.format(**{name: quote(str(given.pop(name)), safe="") for name in command.in_path})
+    return cast("Answer", server.request(command.http, f"{API}{path}", given or None, _LIMIT_S))
+
+
+def order(server: Server, name: str, **given: object) -> Answer:
+    """The same for a command of the stand's service, by its name."""
+    return ask(server, COMMANDS[name], **given)
+
+
+def recipe_of(recipe: str) -> dict[str, object]:
+    """What asks for a recipe: a file's as it is now, or an installed one."""
+    typed = _typed("recipe", _fields(COMMANDS["submit"])["recipe"])
+    return dict([_field("recipe", typed, recipe)])
+
+
 def _verb(command: Command) -> Callable[..., None]:
-    fields = {} if command.argument is None else command.argument.model_fields
-    typed = {name: _typed(name, info) for name, info in fields.items()}
+    fields = _fields(command)
+    typed = {name: shown for name, info in fields.items() if (shown := _typed(name, info)).name}
 
     def verb(**given: Any) -> None:
         place = (given.pop("directory"), given.pop("config"), given.pop("url"), given.pop("token_file"))
-        values = {name: value for name in fields if (value := _value(typed[name], given[typed[name].name])) is not None}
+        values = dict(
+            _field(name, each, value)
+            for name, each in typed.items()
+            if (value := _value(each, given[each.name])) not in (None, False, [])
+        )
         server = reached(*place, anywhere=command.anywhere)
-        if command.name == STOP:
-            answer = server.order(STOP)  # which has a way of its own
-        else:
-            path = command.path.format(**{name: quote(str(values.pop(name)), safe="") for name in command.in_path})
-            answer = cast("Answer", server.request(command.http, f"{API}{path}", values or None, _LIMIT_S))
-        moving = ", ".join(map(one_line, cast("list[str]", answer.get("moving", []))))
-        text = str(answer.get("text") or command.name) + (f"; still moving: {moving}" if moving else "")
-        show(answer, [f"{server.name}: {one_line(text)}"])
+        answer = ask(server, command, **values)
+        show(answer, [_line(server, command, answer)])
 
     verb.__name__, verb.__doc__ = command.method, command.text
-    parameters = {typed[name].name: _option(info, typed[name]) for name, info in fields.items()}
+    parameters = {each.name: _option(fields[name], each) for name, each in typed.items()}
     return with_parameters(verb, _nothing, {**parameters, "directory": (DirectoryArgument, None), **OPTIONS})
+
+
+def _line(server: Server, command: Command, answer: Answer) -> str:
+    """A sentence of what came of it; of what is queued its number, for programs."""
+    if command.answer is not Done:
+        return str(answer.get("id", ""))
+    moving = ", ".join(map(one_line, cast("list[str]", answer.get("moving", []))))
+    text = str(answer.get("text") or command.name) + (f"; still moving: {moving}" if moving else "")
+    return f"{server.name}: {one_line(text)}"
+
+
+def _fields(command: Command) -> dict[str, FieldInfo]:
+    return {} if command.argument is None else cast("type[BaseModel]", command.argument).model_fields
 
 
 def _nothing() -> None:
@@ -66,16 +101,26 @@ def _value(typed: Typed, given: object) -> object:
     return float(str(given)) * typed.unit if typed.unit is not None and given is not None else given
 
 
+def _field(name: str, typed: Typed, value: object) -> tuple[str, object]:
+    """Which field gets what."""
+    if typed.text_in and (path := Path(str(value))).is_file():
+        return typed.text_in, read_document(path)
+    return name, value
+
+
 def _option(info: FieldInfo, typed: Typed) -> tuple[Any, object]:
     """How typer sees a field: what is required is an argument, all else an option."""
     help_text = typed.help or info.description or ""
-    if typed.value is not None:
-        return Annotated[bool, typer.Option(f"--{typed.name.replace('_', '-')}", help=help_text)], False
     kind: Any = info.annotation
+    if typed.value is not None or kind is bool:
+        return Annotated[bool, typer.Option(f"--{typed.name.replace('_', '-')}", help=help_text)], False
+    if get_origin(kind) is tuple:
+        return Annotated[list[str] | None, typer.Option(f"--{typed.name}", help=help_text)], None
     kind = str if get_origin(kind) is Literal and all(isinstance(each, str) for each in get_args(kind)) else kind
-    if info.is_required():
+    if info.is_required() or typed.is_first:
         return Annotated[kind, typer.Argument(metavar=typed.name.upper(), help=help_text)], ...
     return Annotated[kind | None, typer.Option(help=help_text)], None
 
 
+COMMANDS = commands_of(StandService)
 app = app_of(StandService)

@@ -67,7 +67,7 @@ _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer go
 _ENDS = Fault(STOPPED.rule, "the daemon was ended")
 _STOPPED_LOOK_S = 0.1  # whether the run has ended that was stopped
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
-_KEEP_EVERY_S, _READ_EVERY_S = 60.0, 5.0
+_KEEP_EVERY_S = 60.0
 _ENDED_AGAIN_S = 5.0  # between two records that end by themselves
 
 
@@ -419,14 +419,9 @@ class Daemon:
 
     async def _look_after(self) -> None:
         """Midnight, a record that has ended by itself, what is kept for the next start, and what systemd shows."""
-        kept_ns = read_ns = self._clock.now_ns()
-        reading: asyncio.Future[None] | None = None
+        kept_ns = self._clock.now_ns()
         while True:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_LOOK_S))
-            if self._clock.now_ns() - read_ns >= _READ_EVERY_S * NS_PER_S and not self.has_guest:
-                read_ns = self._clock.now_ns()
-                if reading is None or reading.done():  # another program may have locked it
-                    reading = self._beside(self._read_queue())
             may_begin = not (self.has_guest or self.orders.leaving)
             if may_begin:
                 self._status.tell(self.by_hand.doing)
@@ -490,12 +485,6 @@ class Daemon:
             if limit_s is not None and self.open_stand.guard.is_on_time:
                 systemd.tell(systemd.FED)
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(every_s))
-
-    async def _read_queue(self) -> None:
-        """`stand queue add` writes it, too."""
-        with suppress(SessionError):
-            await self.orders.read()
-        self.wake()
 
     async def _clear_queue(self) -> None:
         try:

@@ -62,11 +62,6 @@ def entry_of(order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> 
     )
 
 
-def add(directory: Path, order: Order, config: str, now_ns: int) -> Entry:
-    """Queue a run behind all others; as `entry_of` and `append`."""
-    return append(directory, entry_of(order, config, now_ns))
-
-
 def append(directory: Path, entry: Entry) -> Entry:
     """Queue it behind all others, with a number of its own. With the key of an earlier run: that one. SessionError
     when the request of that key was another."""
@@ -113,7 +108,7 @@ def take(directory: Path, now_ns: int) -> Entry | None:
     with changing(directory) as draft:
         queue = draft.queue
         if queue.halted:
-            remedy = "remove the cause, then `stand queue start --clear`"
+            remedy = "remove the cause, then `stand clear`"
             raise StandTripped(f"{directory}: the queue was halted: {queue.halted}; {remedy}")
         running = next((entry for entry in queue.entries if entry.state is State.RUNNING), None)
         if running is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from thermostand.foundation.clock import Now, WallClock
+from thermostand.foundation.clock import Now
 from thermostand.foundation.errors import (
     ConfigError,
     DeviceError,
@@ -21,10 +21,10 @@ from thermostand.foundation.errors import (
 from thermostand.foundation.events import NOT_CONFIRMED_SAFE
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.patience import Patience
-from thermostand.recording.writing.disk import QUEUE_LINE, Disk, DiskCalls
+from thermostand.recording.writing.disk import DiskCalls
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.queueing.queue import finish, note_session, note_step, queued, take
-from thermostand.stand.queueing.queue_file import Entry, State, working
+from thermostand.stand.queueing.queue_file import Entry, State
 from thermostand.stand.running.memory.entries import Ended
 from thermostand.stand.running.memory.journal import Journal
 from thermostand.stand.running.resume import Interruption, interruption
@@ -49,8 +49,11 @@ class Notes:
 RunOne = Callable[[Entry, Notes], Awaitable[Path]]
 
 
-async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None]) -> None:
-    """Run what is queued in `directory` until nothing is left; `tell` gets a line for every beginning and end.
+async def drain(
+    directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: DiskCalls, patience: Patience
+) -> None:
+    """Run what is queued in `directory`, on which the caller is `working`, until nothing is left; `tell` gets a line
+    for every beginning and end. patience: with the disk at a run's end.
 
     A run that fails is marked and the next one begun, unless the stand tripped, `run_one` raises Halt, a device did not
     answer before the run had begun (the next would fail likewise), or the failure is a mistake of the program: then the
@@ -59,20 +62,6 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
     MOST_FRUITLESS_STARTS times in a row before one more step was done is marked as failed, or it would keep all others
     from their turn.
     """
-    disk = Disk()
-    calls = DiskCalls(disk, QUEUE_LINE, WallClock())
-    try:
-        with working(directory):
-            await drain(directory, run_one, clock, tell, calls, Patience())
-    finally:
-        calls.close()
-        disk.close()
-
-
-async def drain(
-    directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None], disk: DiskCalls, patience: Patience
-) -> None:
-    """As `work`, for a caller that is `working` on the queue already; with `patience` for the disk at a run's end."""
     while (entry := await disk.call(take, directory, clock.now_ns())) is not None:
         run = _Run(directory, entry, clock, tell, disk, patience)
         if entry.fruitless_starts >= MOST_FRUITLESS_STARTS:

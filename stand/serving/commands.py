@@ -5,8 +5,8 @@
         "Leave a step out, or break it off."
 
 From it follow the route and its OpenAPI (api/order_routes.py), the verb of the command line (commands/verbs.py), the
-command that is recorded (`perform`), SECoP's command of the module `run`, and where the page sends an order
-(`GET /api/v1/commands`).
+command that is recorded (`perform`), SECoP's command of the module `run`, and the page's button (`GET
+/api/v1/commands`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import inspect
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import takewhile
 from typing import Any, Literal, TypeVar, cast, get_type_hints
 
@@ -47,13 +47,16 @@ Http = Literal["POST", "PUT", "DELETE"]
 
 @dataclass(frozen=True, slots=True)
 class Typed:
-    """How a field of an argument is typed on the command line: by this name, `unit` of it being one there. value: it is
-    a flag that stands for this value."""
+    """How a field of an argument is typed on the command line: by this name, "" for not at all, `unit` of it being one
+    there. value: it is a flag that stands for this value. is_first: an argument, though it has a default. text_in: the
+    field that has the text of a file, where a file of that name is there."""
 
     name: str
     help: str = ""
     unit: float | None = None
     value: str | None = None
+    is_first: bool = False
+    text_in: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +64,8 @@ class _Mark:
     path: str
     http: Http
     status: int
-    has_verb: bool
+    verbs: tuple[str, ...] | None
+    title: str
     anywhere: bool
     by_secop: str | None
 
@@ -71,20 +75,22 @@ def command(
     *,
     http: Http = "POST",
     status: int = 200,
-    has_verb: bool = True,
+    verbs: tuple[str, ...] | None = None,
+    title: str = "",
     anywhere: bool = False,
     by_secop: str | None = "",
 ) -> Callable[[Method], Method]:
     """A method is a command, at this path below /api/v1, in which {name} is a field of its argument.
 
     It takes who asks and, if anything, one Document, and returns a sentence, for the answer Done, or a value. It raises
-    Conflict when the state forbids it, Missing, or ConfigError when the argument is wrong. has_verb: the command line
-    has a verb for it. anywhere: that verb finds the only stand of this machine. by_secop: the field that SECoP's
-    command takes, "" for the only one that is required, None for no such command.
+    Conflict when the state forbids it, Missing, or ConfigError when the argument is wrong. verbs: of the command line,
+    such as `queue move`; its name where none is given, () for none that only sends. title: what a button for it is
+    called, its name where none is given. anywhere: its verb finds the only stand of this machine. by_secop: the field
+    that SECoP's command takes, "" for the only one that is required, None for no such command.
     """
 
     def mark(method: Method) -> Method:
-        setattr(method, _MARK, _Mark(path, http, status, has_verb, anywhere, by_secop))
+        setattr(method, _MARK, _Mark(path, http, status, verbs, title, anywhere, by_secop))
         return method
 
     return mark
@@ -92,18 +98,13 @@ def command(
 
 @dataclass(frozen=True, slots=True)
 class Command(_Mark):
-    """name: as it is typed and recorded. text: of its docstring. argument: None when it takes none."""
+    """name: as it is recorded. text: of its docstring. argument: None when it takes none."""
 
     name: str
     method: str
     text: str
     argument: type[Document] | None
     answer: type[BaseModel]
-
-    @property
-    def title(self) -> str:
-        """What a button is called."""
-        return self.name.replace("_", " ").capitalize()
 
     @property
     def secop_field(self) -> str | None:
@@ -141,9 +142,11 @@ def _command(method_name: str, method: Callable[..., object], mark: _Mark) -> Co
     hints = get_type_hints(method)
     answer = hints.pop("return")
     argument = [hint for hint in hints.values() if hint is not Who]
+    name = method_name.rstrip("_")
+    title, verbs = mark.title or name.replace("_", " ").capitalize(), (name,) if mark.verbs is None else mark.verbs
     return Command(
-        **asdict(mark),
-        name=method_name.rstrip("_"),
+        **asdict(replace(mark, title=title, verbs=verbs)),
+        name=name,
         method=method_name,
         text=inspect.getdoc(method) or "",
         argument=cast("type[Document]", argument[0]) if argument else None,

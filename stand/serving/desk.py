@@ -274,6 +274,7 @@ class PlanCheck(Value):
 
 # Checked, with a sentence, where it is kept.
 Tag = Annotated[str, Field(max_length=100, json_schema_extra={"pattern": f"^{TAG.pattern}$"})]
+LONGEST_RECIPE = 1 << 18  # characters
 _NAMED: dict[str, Any] = {"properties": {"recipe": {"minLength": 1}}, "required": ["recipe"]}
 _WRITTEN: dict[str, Any] = {"properties": {"recipe_text": {"minLength": 1}}, "required": ["recipe_text"]}
 
@@ -288,7 +289,7 @@ class RunRequest(Document):
     model_config = ConfigDict(json_schema_extra={"oneOf": [_NAMED, _WRITTEN]})
 
     recipe: str = Field(default="", max_length=200)
-    recipe_text: str = Field(default="", max_length=1 << 18)
+    recipe_text: str = Field(default="", max_length=LONGEST_RECIPE)
     attended: bool = Field(default=False, strict=True)
     tags: tuple[Tag, ...] = Field(default=(), max_length=32)
     note: str = Field(default="", max_length=LONGEST_NOTE)

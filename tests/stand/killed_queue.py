@@ -5,12 +5,27 @@ import asyncio
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
-from thermostand.foundation.clock import WallClock
-from thermostand.stand.queueing.queue_file import Entry
-from thermostand.stand.queueing.queue_work import Notes, work
+from thermostand.foundation.clock import Now, WallClock
+from thermostand.foundation.patience import Patience
+from thermostand.recording.writing.disk import QUEUE_LINE, Disk, DiskCalls
+from thermostand.stand.queueing.queue_file import Entry, working
+from thermostand.stand.queueing.queue_work import Notes, RunOne, drain
+
+
+async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None]) -> None:
+    """The queue of a folder, by a process for its disk as a daemon has one."""
+    disk = Disk()
+    calls = DiskCalls(disk, QUEUE_LINE, WallClock())
+    try:
+        with working(directory):
+            await drain(directory, run_one, clock, tell, calls, Patience())
+    finally:
+        calls.close()
+        disk.close()
 
 
 async def run(entry: Entry, notes: Notes) -> NoReturn:

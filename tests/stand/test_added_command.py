@@ -8,15 +8,22 @@ import pytest
 from pydantic import Field
 from typer.testing import CliRunner
 
+from tests.addresses import free_port
+from tests.stand.a_desk import served
+from tests.stand.browser import a_page, browser, needs_chromium
 from tests.stand.secop_desk import SecopDesk, node
 from tests.stand.secop_talk import talking
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event, Item
 from thermostand.stand.commands.verbs import app_of
+from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.client import server_of
 from thermostand.stand.serving.commands import command, commands_of
 from thermostand.stand.serving.desk import Conflict, Who
+from thermostand.stand.serving.page_room import PageRoom
+from thermostand.stand.serving.viewing import Viewing
 
 
 class FlushRequest(Document):
@@ -71,6 +78,7 @@ async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp
             "text": "Blow dry air through the chamber.",
             "method": "POST",
             "path": "/api/v1/run/flush",
+            "argument": FlushRequest.model_json_schema(),
         }
 
 
@@ -105,4 +113,25 @@ async def test_secop_has_it_and_each_order_is_recorded_with_what_came_of_it(tmp_
     assert [(each.data["verb"], each.data["arguments"], each.data["result"]) for each in told] == [
         ("flush", {"for_s": 5.0}, "done"),
         ("flush", {"for_s": 40.0}, "refused: there is air for 30 s"),
+    ]
+
+
+@needs_chromium
+async def test_the_page_has_a_button_with_its_title_and_a_field_for_each_thing_that_it_takes(tmp_path: Path):
+    desk, port = Flushing(), free_port()
+    viewing = Viewing(desk.hub, desk.clock, tmp_path, "")
+
+    def room(bridge: Bridge) -> Any:
+        return PageRoom(viewing)(bridge)
+
+    interface = Interface(tmp_path, port=port, rooms=(room,))
+    async with served(desk, tmp_path / "night", interface), browser() as windows, a_page(windows, port, "plan") as page:
+        form = page.locator("form").filter(has=page.get_by_role("button", name="Flush", exact=True))
+        await form.get_by_label("for, s").fill("5")
+        await form.get_by_label("gently").check()
+        await form.get_by_role("button", name="Flush").click()
+        await page.get_by_text("flushed for 5 s, gently").wait_for()
+        assert await page.get_by_role("button", name="Pause now").count() == 1  # called as its command is
+    assert [(who.how, verb, arguments) for who, verb, arguments in desk.orders] == [
+        ("loopback", "flush", {"for_s": 5.0, "gently": True})
     ]

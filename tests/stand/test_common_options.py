@@ -168,4 +168,9 @@ def test_a_session_that_is_not_there_has_one_status_in_both_programs(typed: str,
 def test_every_command_of_a_session_is_in_that_table():
     named = {"session", "sessions", "directory", "sources"}
     found = {typed for typed, command in EACH if named & {each.name for each in command.params[:1]}}
-    assert found - OF_A_SESSION.keys() == {"stand init", "stand session archive", "stand token login"}
+    assert found - OF_A_SESSION.keys() == {
+        "stand init",
+        "stand session archive",
+        "stand token login",
+        "stand queue list",
+    }

@@ -12,9 +12,15 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.recording.writing.disk import Disk
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.daemon import systemd
 from thermostand.stand.daemon.daemon_file import Counters, Kept, KeptFile, kept_in
 from thermostand.stand.daemon.serve import Reports
+from thermostand.stand.queueing.orders import Orders
+from thermostand.stand.running.opening.open_stand import OpenStand
+from thermostand.stand.serving.desk import Conflict, RunRequest, Who
 
 
 def read(hub: Hub, time_s: float, **values: float) -> None:
@@ -129,3 +135,21 @@ async def test_a_run_whose_report_fails_is_an_event_and_the_next_has_its_turn(tm
     (line,) = reported
     assert line.startswith(f"not_reported: {tmp_path / 'first'} is recorded, but not reported: ")
     assert f"`compensate report {tmp_path / 'first'} -o report.html` tries again" in line
+
+
+async def test_a_run_is_queued_only_when_what_it_needs_answers(tmp_path: Path):
+    config, clock, disk = load_config(packaged("", "simulated")), WallClock(), Disk()
+    texts = {
+        "config.yaml": packaged("", "simulated").read_text(),
+        "target.yaml": packaged("targets", config.target).read_text(),
+    }
+    hub = Hub()
+    open_stand = OpenStand(assemble(config, hub, clock), disk, Patience(), is_for_one=False)
+    orders, who = Orders(open_stand, disk, tmp_path, "simulated", texts), Who(name="rose", how="token")
+    now_ns, request = clock.now_ns(), RunRequest(recipe="warm-up")
+    hub.publish(Batch("x", now_ns, (bad_reading("thermometers.air", "degC", now_ns, "no answer", "wire"),)))
+    with pytest.raises(Conflict, match=r"thermometers\.air is not read: no answer"):
+        await orders.submit(who, request, "")
+    hub.publish(Batch("x", now_ns, (Reading("thermometers.air", 24.0, "degC", now_ns),)))
+    assert (await orders.submit(who, request, "")).id == 1
+    disk.close()

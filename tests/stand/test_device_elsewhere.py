@@ -6,7 +6,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from tests.stand.a_desk import ADesk, served
-from thermostand.stand.commands.order_cli import app as order_app
+from thermostand.stand.commands.command_table import app as order_app
 
 
 async def test_devices_by_hand_name_the_daemon_that_runs_elsewhere(tmp_path: Path):

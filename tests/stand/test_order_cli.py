@@ -9,21 +9,20 @@ from typer.testing import CliRunner, Result
 from tests.stand.a_desk import ADesk, served
 from tests.stand.test_interface_access import book, free_port
 from thermostand.stand.commands.command_table import app as stand
-from thermostand.stand.commands.order_cli import app
 from thermostand.stand.serving.api.doors import Interface
 
 TOKEN = "correct-horse-battery-staple"
 
 
 async def invoke(*arguments: object) -> Result:
-    return await asyncio.to_thread(CliRunner().invoke, app, [str(argument) for argument in arguments])
+    return await asyncio.to_thread(CliRunner().invoke, stand, [str(argument) for argument in arguments])
 
 
 async def test_a_run_is_submitted_once_for_each_key(tmp_path: Path):
     recipe = tmp_path / "night.yaml"
     recipe.write_text("name: night\n")
     async with served(ADesk(), tmp_path / "sessions") as desk:
-        there = ("--dir", tmp_path / "sessions")
+        there = (tmp_path / "sessions",)
         assert (await invoke("submit", recipe, *there, "--key", "monday")).stdout == "1\n"
         assert (await invoke("submit", recipe, *there, "--key", "monday")).stdout == "1\n"
         other = await invoke("submit", "demo", *there, "--key", "monday")

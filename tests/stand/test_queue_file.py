@@ -23,7 +23,7 @@ ORDER = load_order("warm-up", "simulated")
 
 
 def add(directory: Path, order: Order = ORDER) -> int:
-    return queue.add(directory, order, "simulated", 1).id
+    return queue.append(directory, queue.entry_of(order, "simulated", 1)).id
 
 
 def states(directory: Path) -> list[tuple[int, str]]:
@@ -247,7 +247,7 @@ order = load_order("warm-up", "simulated")
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(20):
-    number = queue.add(Path(sys.argv[1]), order, "simulated", 1).id
+    number = queue.append(Path(sys.argv[1]), queue.entry_of(order, "simulated", 1)).id
     queue.move(Path(sys.argv[1]), number, 1)
 """
 

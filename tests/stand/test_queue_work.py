@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from tests import forked
+from tests.stand.killed_queue import work
 from thermostand.foundation.clock import FollowedClock
 from thermostand.foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Unreachable
 from thermostand.stand.queueing import queue
 from thermostand.stand.queueing.queue_file import Entry, working
-from thermostand.stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped, work
+from thermostand.stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped
 from thermostand.stand.running.opening.stop import Interrupted
 from thermostand.stand.running.order import load_order
 
@@ -30,7 +31,7 @@ class Runs:
         self.lines: list[str] = []
         self.seen: list[tuple[int, str]] = []
         for _ in ends:
-            queue.add(directory, ORDER, "simulated", 1)
+            queue.append(directory, queue.entry_of(ORDER, "simulated", 1))
 
     async def run(self, entry: Entry, notes: Notes) -> Path:
         self.seen.append((entry.id, entry.session))
@@ -66,7 +67,7 @@ async def test_what_is_added_while_a_run_is_under_way_has_its_turn(tmp_path: Pat
 
     async def run(entry: Entry, notes: Notes) -> Path:
         if entry.id == 1:
-            queue.add(tmp_path, ORDER, "simulated", 1)
+            queue.append(tmp_path, queue.entry_of(ORDER, "simulated", 1))
         return tmp_path / str(entry.id)
 
     await work(tmp_path, run, FollowedClock(7), runs.lines.append)
@@ -75,7 +76,7 @@ async def test_what_is_added_while_a_run_is_under_way_has_its_turn(tmp_path: Pat
 
 @pytest.mark.parametrize("session_first", [False, True])
 async def test_a_stand_that_another_run_has_ends_the_work_and_fails_no_run(tmp_path: Path, session_first: bool):
-    """Nothing was touched, so nobody has to look: the next `stand queue start` tries again."""
+    """Nothing was touched, so nobody has to look: the next start tries again."""
     runs = Runs(tmp_path, InUse("bus", "is in use by session night (pid 7)"), None, session_first=session_first)
     with pytest.raises(InUse, match=r"is in use by session night"):
         await runs.work()
@@ -190,7 +191,7 @@ def worker_killed(directory: Path, steps_done: int) -> None:
 
 async def test_a_run_whose_daemon_dies_three_times_before_another_step_is_set_aside(tmp_path: Path):
     runs = Runs(tmp_path, None)
-    queue.add(tmp_path, ORDER, "simulated", 1)
+    queue.append(tmp_path, queue.entry_of(ORDER, "simulated", 1))
     for steps_done in (0, 0, 2, 0, 0, 0):  # what the third has done begins the count again
         worker_killed(tmp_path, steps_done)
         assert runs.entries()[0] == ("interrupted", "night", "its daemon was killed")

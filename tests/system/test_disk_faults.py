@@ -151,7 +151,7 @@ class Stand:
 
     def keep(self, number):
         """Change each small file once more."""
-        queue.add(self.sessions, self.order, "simulated", START_NS + number)
+        queue.append(self.sessions, queue.entry_of(self.order, "simulated", START_NS + number))
         if number == 2:
             queue.take(self.sessions, START_NS + number)
         keep(self.sessions / "compressor.json", compressor(number), BOOT)

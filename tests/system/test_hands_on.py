@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from tests.system.conftest import require_aravis
 from tests.system.test_check import laboratory
-from thermostand.stand.commands.order_cli import app
+from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.running.order import Order
 from thermostand.stand.simulator import Simulator

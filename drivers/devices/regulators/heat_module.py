@@ -360,6 +360,5 @@ KIND = DeviceKind(
     is_opened=False,  # by the regulator that heats by it
     address_key="",
     simulated_map="icpdas-m7024",
-    asks_only=False,
     check=_check,
 )

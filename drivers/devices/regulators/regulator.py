@@ -235,7 +235,6 @@ KIND = DeviceKind(
     rank=20,
     address_key="",
     simulated_map="omron-e5cc",
-    asks_only=False,
     check=check_controller,
     verbs=CONTROL,
 )

@@ -9,7 +9,7 @@ from typing import Annotated, Any, cast
 
 from fastapi import APIRouter, Header, Path, Request, Response
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ValidationError, create_model
+from pydantic import BaseModel, JsonValue, ValidationError, create_model
 from pydantic.fields import FieldInfo
 
 from thermostand.foundation.documents import Document
@@ -22,13 +22,15 @@ _KEY = "idempotency_key"  # the header that does what a field `key` does
 
 
 class CommandInfo(BaseModel):
-    """A command: its name, what a button for it is called, what it does, and how it is given."""
+    """A command: its name, what a button for it is called, what it does, how it is given, and the JSON Schema of what
+    it takes, {} for nothing."""
 
     name: str
     title: str
     text: str
     method: str
     path: str
+    argument: dict[str, JsonValue]
 
 
 def commands(bridge: Bridge) -> APIRouter:
@@ -49,7 +51,14 @@ def commands(bridge: Bridge) -> APIRouter:
     async def known() -> Response:
         """What may be ordered, and how."""
         return _list(
-            CommandInfo(name=each.name, title=each.title, text=each.summary, method=each.http, path=f"{API}{each.path}")
+            CommandInfo(
+                name=each.name,
+                title=each.title,
+                text=each.summary,
+                method=each.http,
+                path=f"{API}{each.path}",
+                argument={} if each.argument is None else each.argument.model_json_schema(),
+            )
             for each in bridge.commands.values()
         )
 

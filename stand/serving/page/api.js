@@ -27,7 +27,20 @@ export async function send(method, path, body) {
 // What may be ordered, by name: where, and what it is called.
 let table = null;
 const STOP = { method: "POST", path: `${BASE}/run/stop` }; // which waits for no table
-async function commands() { return (table ??= new Map((await get("/commands")).map((each) => [each.name, each]))); }
+export function commands() {
+  table ??= get("/commands").then((found) => new Map(found.map((each) => [each.name, each])));
+  table.catch(() => { table = null; });
+  return table;
+}
+
+// A button that is called as the service calls its command. `text`: with what else; `label`: for who does not see it.
+export function called(name, button, text = (title) => title, label = null) {
+  commands().then((known) => known.get(name).title, () => name).then((title) => {
+    button.textContent = text(title);
+    if (label) button.setAttribute("aria-label", label(title));
+  });
+  return button;
+}
 
 // Orders the command of that name with what its argument takes; `said`: what it is called here. `place` gets the
 // outcome; returns the answer, or null when it was refused.

@@ -1,5 +1,5 @@
 // What needs somebody: a fault, a prompt, a pause, a connection that is lost. Below the header, never over STOP.
-import { order } from "./api.js";
+import { called, order } from "./api.js";
 import { temperatures, look_of } from "./channels.js";
 import { clock, day_clock, fill, h, number, say, seconds, unit_of, words } from "./dom.js";
 
@@ -78,7 +78,7 @@ export class Notices {
     const answer = h("p", { class: "answer", role: "status" });
     const review = h("div", { hidden: true });
     const readings = h("dl", { class: "facts" });
-    const clear = h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "clear") }, "The cause is removed: clear");
+    const clear = called("clear", h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "clear") }), (title) => `The cause is removed: ${title.toLowerCase()}`);
     const open = h("button", { type: "button", "aria-expanded": "false", onclick: () => {
       review.hidden = !review.hidden;
       open.setAttribute("aria-expanded", String(!review.hidden));
@@ -143,7 +143,7 @@ export class Notices {
   held(state) {
     const answer = h("p", { class: "answer", role: "status" });
     const is_mine = state.reasons.includes("operator");
-    const button = h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "continue") }, "Continue");
+    const button = called("continue", h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "continue") }));
     const text = h("p", {});
     const element = h("section", { class: "notice warning" }, h("h2", {}, `The run is held: ${state.reasons.map(reason).join("; ")}`),
       text, is_mine ? h("div", { class: "row" }, button) : null, answer);

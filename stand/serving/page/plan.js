@@ -1,10 +1,12 @@
 // The plan as a time line and as a list: what is done, what is earned, what is to come and when.
-import { get, order, tell } from "./api.js";
-import { ask, axes_of, clock, css, day_clock, duration, fill, h, number, say, seconds } from "./dom.js";
+import { called, commands, get, order, tell } from "./api.js";
+import { ask, axes_of, clock, css, day_clock, duration, fill, h, number, say, seconds, words } from "./dom.js";
 import { PlanEdit, step_schema } from "./plan_edit.js";
 
 const SIGN = { done: "✓", under_way: "▶", waiting: "·", skipped: "⤼" };
 const WORD = { done: "done", under_way: "under way", waiting: "to come", skipped: "left out" };
+// Commands that have a place of their own.
+const PLACED = new Set(["stop", "pause", "continue", "clear", "skip", "extend", "edit", "submit", "cancel", "move", "resume", "device", "note", "fault"]);
 const SHOWN_DONE = 3;
 const MOST_ROWS = 300;
 
@@ -15,9 +17,9 @@ export class Plan {
     this.steps = [];
     this.answer = h("p", { class: "answer", role: "status" });
     this.buttons = h("div", { class: "row" },
-      this.pause = h("button", { type: "button", "data-order": "", onclick: () => this.order("pause", { when: "now" }, "pause") }, "Pause now"),
+      this.pause = called("pause", h("button", { type: "button", "data-order": "", onclick: () => this.order("pause", { when: "now" }, "pause") }), (title) => `${title} now`),
       this.pause_step = h("button", { type: "button", "data-order": "", onclick: () => this.pause_after() }, "Pause after this step"),
-      this.go = h("button", { type: "button", "data-order": "", class: "main", onclick: () => this.order("continue", undefined, "continue") }, "Continue"),
+      this.go = called("continue", h("button", { type: "button", "data-order": "", class: "main", onclick: () => this.order("continue", undefined, "continue") })),
       this.edit_button = h("button", { type: "button", "data-order": "", onclick: () => this.edit() }, "Edit the steps to come …"),
       this.abort = h("button", { type: "button", class: "danger", onclick: () => this.end() }, "End the run …"));
     this.summary = h("p", {});
@@ -25,8 +27,10 @@ export class Plan {
     this.list = h("ol", { class: "steps" });
     this.asks = h("div", {});
     this.edits = h("div", {});
+    this.more = h("div", { class: "row" });
+    commands().then((known) => fill(this.more, [...known.values()].filter(({ name }) => !PLACED.has(name)).map((each) => this.form(each))), () => {});
     fill(place, h("div", { class: "stack" },
-      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Run"), this.buttons), this.summary, this.asks, this.answer, this.edits, this.line,
+      h("section", { class: "panel" }, h("div", { class: "head" }, h("h2", {}, "Run"), this.buttons), this.more, this.summary, this.asks, this.answer, this.edits, this.line,
         h("p", { class: "quiet" }, "tall: frames are taken; low: soaks and the rest; the line is now")),
       h("section", { class: "panel" }, h("h2", {}, "Steps"), this.list)));
     this.resizing = new ResizeObserver(() => this.draw());
@@ -38,6 +42,19 @@ export class Plan {
   async order(verb, body, text) {
     await order(this.answer, verb, body, text);
     this.refresh();
+  }
+
+  // A command that has no place of its own on this page: its button, and a field for each thing that it takes.
+  form({ name, title, text, argument }) {
+    const fields = Object.entries(argument.properties ?? {}).map(([field, { type, description }]) => {
+      const is_number = type === "number" || type === "integer", kind = type === "boolean" ? "checkbox" : is_number ? "number" : "text";
+      const input = h("input", { type: kind, step: is_number ? "any" : null, size: 8, title: description, required: argument.required?.includes(field) });
+      const value = () => (kind === "checkbox" ? input.checked : is_number && input.value ? Number(input.value) : input.value);
+      return { field, value, shown: h("label", {}, `${words(field)} `, input) };
+    });
+    const given = () => Object.fromEntries(fields.map(({ field, value }) => [field, value()]).filter(([, value]) => value !== "" && value !== false));
+    return h("form", { class: "row", title: text, onsubmit: (event) => { event.preventDefault(); this.order(name, given(), title.toLowerCase()); } },
+      fields.map(({ shown }) => shown), h("button", { type: "submit", "data-order": "" }, title));
   }
 
   pause_after() {
@@ -88,7 +105,7 @@ export class Plan {
   row(step) {
     const is_open = step.standing === "waiting" || step.standing === "under_way";
     const acts = h("span", { class: "acts" });
-    const button = (name, act) => acts.append(h("button", { type: "button", class: "small", "data-order": "", "data-key": `${step.step_id} ${name}`, "aria-label": `${name}: step ${step.index + 1}`, onclick: act }, name));
+    const button = (name, act, text) => acts.append(called(name, h("button", { type: "button", class: "small", "data-order": "", "data-key": `${step.step_id} ${name}`, onclick: act }), text, (title) => `${text ? text(title) : title}: step ${step.index + 1}`));
     const row = h("li", { "data-standing": step.standing },
       h("span", { title: WORD[step.standing] }, h("span", { "aria-hidden": "true" }, SIGN[step.standing]), h("span", { class: "unseen" }, WORD[step.standing])),
       h("span", { class: "index number quiet" }, String(step.index + 1)),
@@ -96,9 +113,9 @@ export class Plan {
       h("span", { class: "bar" }, step.standing === "under_way" ? bar(step) : null),
       h("span", { class: "number quiet" }, this.when(step)), acts);
     if (is_open && step.kind.startsWith("soak")) {
-      button("+15 min", () => this.order("extend", { step_id: step.step_id, by_s: 900 }, "extend by 15 min"));
+      button("extend", () => this.order("extend", { step_id: step.step_id, by_s: 900 }, "extend by 15 min"), () => "+15 min");
     }
-    if (is_open) button("Skip", () => ask(row, `Leave out step ${step.index + 1}, ${step.text || step.kind}?`, "Leave it out", () => this.order("skip", { step_id: step.step_id }, "skip")));
+    if (is_open) button("skip", () => ask(row, `Leave out step ${step.index + 1}, ${step.text || step.kind}?`, "Leave it out", () => this.order("skip", { step_id: step.step_id }, "skip")));
     return row;
   }
 

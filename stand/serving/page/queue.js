@@ -1,5 +1,5 @@
 // The queue of runs, and the form that adds one.
-import { get, order, tell } from "./api.js";
+import { called, get, order, tell } from "./api.js";
 import { ask, axes_of, day_clock, duration, fill, h, hold_resumes, seconds } from "./dom.js";
 import { RecipeForm } from "./recipe_form.js";
 
@@ -110,17 +110,17 @@ export class Queue {
   row(run, movable) {
     const at = movable.indexOf(run), offset_ns = this.app.state.utc_offset_ns;
     const acts = h("span", { class: "row" });
-    const button = (name, label, act, disabled = false) => acts.append(h("button", { type: "button", class: "small", "data-order": "", "data-resume": name === "Resume", "aria-label": `${label}: run ${run.id}`, disabled, onclick: act }, name));
+    const button = (name, act, sign, label, disabled = false) => acts.append(called(name, h("button", { type: "button", class: "small", "data-order": "", "data-resume": name === "resume", disabled, onclick: act }), (title) => sign ?? title, (title) => `${label ?? title}: run ${run.id}`));
     const row = h("li", { draggable: at >= 0 ? "true" : undefined }, h("span", { class: "number quiet" }, String(run.id)),
       h("span", {}, h("b", {}, run.recipe), ` ${run.state}`, time_of(run),
         h("br"), h("small", {}, [run.reason, run.added_by && `by ${run.added_by}`, `added ${day_clock(seconds(run.added_ns, offset_ns))}`, run.session].filter(Boolean).join(" · "))), acts);
     if (at >= 0) {
-      button("▲", "Earlier", () => this.move(run, at), at === 0);
-      button("▼", "Later", () => this.move(run, at + 2), at === movable.length - 1);
-      button("Remove", "Remove", () => ask(row, `Take run ${run.id} (${run.recipe}) out of the queue?`, "Remove it", () => order(this.answer, "cancel", { run: run.id }, "remove")));
+      button("move", () => this.move(run, at), "▲", "Earlier", at === 0);
+      button("move", () => this.move(run, at + 2), "▼", "Later", at === movable.length - 1);
+      button("cancel", () => ask(row, `Take run ${run.id} (${run.recipe}) out of the queue?`, "Remove it", () => order(this.answer, "cancel", { run: run.id }, "remove")));
       this.drag(row, run, at);
     }
-    if (RESUMABLE.includes(run.state) && run.session) button("Resume", "Resume", () => order(this.answer, "resume", { session: run.session }));
+    if (RESUMABLE.includes(run.state) && run.session) button("resume", () => order(this.answer, "resume", { session: run.session }));
     return row;
   }
 

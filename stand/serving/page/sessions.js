@@ -1,5 +1,5 @@
 // Recorded sessions, their reports, and two nights one over the other.
-import { get, order, tell } from "./api.js";
+import { called, get, order, tell } from "./api.js";
 import { look_of } from "./channels.js";
 import { swatch } from "./now.js";
 import { bytes, css, dated_clock, duration, fill, h, hold_resumes, seconds } from "./dom.js";
@@ -55,8 +55,8 @@ export class Sessions {
     const took = each.begin_ns && each.end_ns ? duration((each.end_ns - each.begin_ns) / 1e9) : "–";
     const path = encodeURIComponent(each.name), actions = h("span", { class: "row" });
     if (each.has_report) actions.append(h("a", { href: `/api/v1/sessions/${path}/report.html`, target: "_blank", rel: "noopener" }, "report"));
-    if (RESUMABLE.includes(each.run)) actions.append(h("button", { type: "button", class: "small", "data-order": "", "data-resume": "", "aria-label": `Resume ${each.name}`, onclick: () => order(this.answer, "resume", { session: each.name }, `resume ${each.name}`) }, "Resume"));
-    actions.append(h("button", { type: "button", class: "small", "data-order": "", "aria-label": `Add a note to ${each.name}`, onclick: () => this.note(each, actions) }, "Note"));
+    if (RESUMABLE.includes(each.run)) actions.append(called("resume", h("button", { type: "button", class: "small", "data-order": "", "data-resume": "", onclick: () => order(this.answer, "resume", { session: each.name }, `resume ${each.name}`) }), undefined, (title) => `${title} ${each.name}`));
+    actions.append(called("note", h("button", { type: "button", class: "small", "data-order": "", onclick: () => this.note(each, actions) }), undefined, () => `Add a note to ${each.name}`));
     const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
     return h("tr", {}, h("td", {}, box),
       h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)]),

@@ -1,4 +1,4 @@
-"""The commands for a stand that `stand serve` owns: submit a run, tell a device something by hand."""
+"""`stand device`: one device by hand, by the daemon that has the stand, or opened for this command."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, cast
-from urllib.parse import quote
 
 import typer
 from pydantic import JsonValue
@@ -19,39 +18,15 @@ from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.reached import (
     ConfigOption,
     DirectoryOption,
-    RecipeArgument,
     TokenOption,
     UrlOption,
-    on_stand,
     reached,
 )
-from thermostand.stand.commands.submitted import submit_recipe
-from thermostand.stand.serving.client import API, Answer, Server, running_sessions
+from thermostand.stand.commands.verbs import order
+from thermostand.stand.serving.client import API, Server, running_sessions
 from thermostand.stand.serving.desk import DeviceState, StandState
 
 app = App()
-
-_LIMIT_S = 60.0  # a device may move for so long
-
-
-@app.command()
-@on_stand(by_option=True)
-def submit(
-    server: Server,
-    recipe: RecipeArgument,
-    attended: Annotated[
-        bool, typer.Option("--attended", help="A person will do what the plan's prompts ask for.")
-    ] = False,
-    key: Annotated[
-        str, typer.Option(help="A name of your own for this order: the same name again queues nothing.")
-    ] = "",
-) -> None:
-    """Submit a recipe, as it is now, to the stand's daemon, which queues it. Prints its number.
-
-    Example: stand submit night.yaml --key monday
-    """
-    run = submit_recipe(server, recipe, attended=attended, key=key)
-    show(run.model_dump(mode="json"), [run.id])
 
 
 @app.command()
@@ -97,9 +72,7 @@ def _by_daemon(server: Server, name: str, verb: str, arguments: dict[str, object
         return
     if verb in ("registers", "grab"):
         raise ConfigError(f"{verb} is for a stand that no daemon has; the daemon takes a frame by `{name} frame`")
-    body: dict[str, object] = {"arguments": arguments}
-    path = f"{API}/devices/{quote(name, safe='')}/{quote(verb, safe='')}"
-    answer = cast("Answer", server.request("POST", path, body, _LIMIT_S))
+    answer = order(server, "device", device=name, verb=verb, arguments=arguments)
     show(answer, [one_line(answer["text"] or f"{name}: {verb}")])
 
 
