@@ -16,10 +16,8 @@ import signal
 import sys
 
 from thermostand.drivers.sim.control import serve_control
-from thermostand.drivers.sim.fault_schedule import FaultSchedule, parse_fault
-from thermostand.drivers.sim.laboratory import Laboratory
-from thermostand.drivers.sim.laboratory_faults import table
-from thermostand.drivers.sim.laboratory_spec import LaboratorySpec
+from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
+from thermostand.drivers.sim.laboratory_faults import FaultSchedule, known_to, parse_fault, table
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.ending import Ending
 from thermostand.foundation.errors import ConfigError
@@ -36,11 +34,16 @@ def main() -> int:
     ending, parent = Ending((signal.SIGTERM, signal.SIGINT)), os.getppid()
     try:
         spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
-        faults = [parse_fault(text) for text in spec.faults]
         laboratory = Laboratory(spec)
-        schedule = FaultSchedule(laboratory, faults)
     except (ConfigError, OSError) as error:
         print(f"{error}", file=sys.stderr)  # noqa: T201 - the process' answer to who started it
+        return 2
+    try:
+        faults = [parse_fault(text, known_to(laboratory)) for text in spec.faults]
+        schedule = FaultSchedule(laboratory, faults)
+    except ConfigError as error:
+        laboratory.close()
+        print(f"{error}", file=sys.stderr)  # noqa: T201 - as above
         return 2
     control = serve_control(laboratory, schedule, ending.ask)
     addresses = {**laboratory.addresses, "control": control.address}

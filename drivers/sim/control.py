@@ -18,11 +18,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
-from thermostand.drivers.sim.fault_schedule import FaultSchedule
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.laboratory import Laboratory
-from thermostand.drivers.sim.laboratory_faults import FAULTS, inject, table
-from thermostand.drivers.sim.wire import Lines, TcpWire
+from thermostand.drivers.sim.laboratory_faults import FaultSchedule, inject, table
+from thermostand.drivers.sim.wire import LineEngine, LinkFaults, TcpWire
 from thermostand.foundation.addresses import tcp_place
 from thermostand.foundation.errors import ConfigError
 
@@ -65,7 +63,7 @@ class Control:
             case {"do": "optics"}:
                 return {"centres_px": self._laboratory.true_centres_px()}
             case {"do": "faults"}:
-                return {"faults": table(), "standing": self._schedule.standing()}
+                return {"faults": table(self._schedule.known), "standing": self._schedule.standing()}
             case {"do": "break", "name": str(name), "value": value, "for_s": int() | float() | None as for_s}:
                 self._schedule.break_now(name, value, for_s)
                 return {"name": name}
@@ -73,8 +71,8 @@ class Control:
                 self._schedule.mend(name)
                 return {"name": name}
             case {"do": "fault", "name": str(name), "value": value}:
-                if name not in FAULTS:
-                    raise ValueError(f"no fault {name!r}; there are {', '.join(sorted(FAULTS))}")
+                if name not in self._schedule.known:
+                    raise ValueError(f"no fault {name!r}; there are {', '.join(sorted(self._schedule.known))}")
                 inject(self._laboratory, name, value)
                 return {"name": name}
             case _:
@@ -85,4 +83,4 @@ def serve_control(laboratory: Laboratory, schedule: FaultSchedule, quit_: Callab
     """Listen on the laboratory's control address; `quit_` is called for a `quit` request."""
     control = Control(laboratory, schedule, quit_)
     place = tcp_place(laboratory.spec.control, may_be_free=True)
-    return TcpWire(*place, lambda: Lines(control.answer), LinkFaults())
+    return TcpWire(*place, lambda: LineEngine(control.answer), LinkFaults())

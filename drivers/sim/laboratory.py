@@ -10,7 +10,9 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from thermostand.drivers.camera_preset import CameraPreset, Effect
 from thermostand.drivers.sim.fakes import (
     CAMERAS,
     CONTACTS,
@@ -24,30 +26,81 @@ from thermostand.drivers.sim.fakes import (
     fake,
     fake_of,
 )
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.genicam_file import read_genicam
-from thermostand.drivers.sim.gige.switch import Switch
-from thermostand.drivers.sim.laboratory_spec import LaboratorySpec
-from thermostand.drivers.sim.link_faults import Link
+from thermostand.drivers.sim.gige.gvsp_sender import Switch
 from thermostand.drivers.sim.motion.flap import FakeFlap
 from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.physics.optics import CameraKind, true_centres_px
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
 from thermostand.drivers.sim.physics.published_camera import PublishedCamera
-from thermostand.drivers.sim.physics.scene import Scene, SceneSpec, still
+from thermostand.drivers.sim.physics.scene import SceneSpec, SimulatedScene, still
 from thermostand.drivers.sim.units.climate_chambers import FakeClimateChamber
 from thermostand.drivers.sim.units.heat_module import FakeHeatModule
 from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, Unit
 from thermostand.drivers.sim.units.regulator import FakeRegulator
 from thermostand.drivers.sim.units.relays import FakeRelays
-from thermostand.drivers.sim.units.rtd_sensors import RtdModule
 from thermostand.drivers.sim.units.thermal_imager import FakeThermalImager
-from thermostand.drivers.sim.units.thermometers import FakeThermometers
-from thermostand.drivers.sim.wire import Engine, PtyWire, TcpWire
+from thermostand.drivers.sim.units.thermometers import FakeThermometers, RtdModule
+from thermostand.drivers.sim.wire import Engine, FaultyLink, LinkFaults, PtyWire, TcpWire
 from thermostand.foundation.addresses import tcp_place
 from thermostand.foundation.clock import FollowedClock, WallClock
+from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
+
+# What the simulator process reads on its standard input: which fakes there are, and where each answers.
+
+
+class CameraSpec(Document):
+    """A camera; optics: none is as `camera_kind`. preset: the camera's own physics instead, with these effects, and its
+    number where it is drawn. genicam: the file of another make, which it then shows. still: it
+    renders a picture once and shows it from then on, for measurements of time on the machine that simulates."""
+
+    address: str | None
+    serial_number: str | None
+    optics: CameraKind | None = None
+    preset: CameraPreset | None = None
+    effects: tuple[Effect, ...] = ()
+    drawn: int | None = None
+    genicam: Path | None = None
+    still: bool = False
+
+
+class DeviceSpec(Document):
+    """A device. fake: its key in drivers.sim.fakes. settings: as the stand's file has them, and what its fake needs to
+    know of the rest of that file."""
+
+    fake: str
+    settings: dict[str, Any]
+
+
+class LaboratorySpec(Document):
+    """What the simulator process reads on its standard input.
+
+    Port 0, "serial:" without a path and a camera without an address stand for free ones. All cameras see the same.
+    """
+
+    virtual: bool
+    control: str
+    start_ns: int = Field(ge=0)
+    seed: int
+    camera_kind: CameraKind
+    laboratory_degC: float
+    chamber_seed: int | None = None
+    bus: str
+    devices: dict[str, DeviceSpec]
+    camera_boot_s: float = Field(default=3.0, ge=0)
+    faults: tuple[str, ...] = ()
+
+    @property
+    def cameras(self) -> dict[str, CameraSpec]:
+        """By name."""
+        return {
+            name: CameraSpec.model_validate(each.settings)
+            for name, each in self.devices.items()
+            if each.fake == "cameras"
+        }
+
 
 # How fast frames leave: as a camera's readout in real time; in virtual time nothing else moves meanwhile.
 _PACE_MBps = {False: 40.0, True: 120.0}
@@ -84,7 +137,7 @@ class Laboratory:
         self.fakes: dict[str, object] = {}
         self.published: dict[str, PublishedCamera] = {}
         self.addresses: dict[str, str] = {}
-        self._links: dict[str, Link] = {}
+        self._links: dict[str, FaultyLink] = {}
         self._units: list[Unit] = []
         self.switch: Switch | None = None
         self.ssr_welded_share = 0.0
@@ -188,11 +241,17 @@ class Laboratory:
         """Whether its time moves by `advance` alone."""
         return self._followed is not None
 
-    def link(self, name: str) -> Link:
-        """The wire of the bus or an axis; ValueError when there is none."""
-        if name not in self._links:
+    @property
+    def links(self) -> dict[str, FaultyLink]:
+        """The wires of the bus and of the devices that have one of their own, by name; chamber: also a regulator's."""
+        alias = {"chamber": self._links["regulator"]} if "regulator" in self._links else {}
+        return alias | self._links
+
+    def link(self, name: str) -> FaultyLink:
+        """One of them; ValueError when there is none."""
+        if name not in self.links:
             raise ValueError(f"this laboratory has no {name}")
-        return self._links[name]
+        return self.links[name]
 
     def axis(self, name: str) -> FakeAxis:
         """One axis of the table; ValueError when there is none."""
@@ -212,16 +271,12 @@ class Laboratory:
 
     def state(self) -> dict[str, float]:
         """The plant's true state now; `now_ns` is the laboratory's time. The flap is faster than the plant's grid."""
-        with self.plant.lock:
-            now_ns = self.clock.now_ns()
-            self.plant.advance(now_ns)
+        with self.plant.at(self.clock) as now_ns:
             return {"now_ns": now_ns, **self.plant.state(), "flap_open": self.plant.flap_open_at(now_ns)}
 
     def true_centres_px(self) -> list[list[float]]:
         """Noise-free marker centres (x, y) as the camera named so, or the first, sees them; marker 1 first."""
-        with self.plant.lock:
-            now_ns = self.clock.now_ns()
-            self.plant.advance(now_ns)
+        with self.plant.at(self.clock) as now_ns:
             leading = "camera" if "camera" in self._cameras else next(iter(self._cameras), "")
             return true_centres_px(self.plant.optics(now_ns, self._optics_of(leading))).tolist()
 
@@ -242,7 +297,7 @@ class Laboratory:
             wire: PtyWire | TcpWire = PtyWire(Path(path) if path else None, make_engine(), faults)
         else:
             wire = TcpWire(*tcp_place(address, may_be_free=True), make_engine, faults)
-        self._links[name] = Link(wire, faults)
+        self._links[name] = FaultyLink(wire, faults)
         self.found_at(name, wire.address, wire.close)
 
     def found_at(self, name: str, address: str, close: Callable[[], None]) -> None:
@@ -292,7 +347,7 @@ class Laboratory:
         """A new one at its address, or at a free one: GVCP's port is fixed, but any of 127.0.0.0/8 will do."""
         settings = self._cameras[name]
         seed = self.seed + (zlib.crc32(name.encode()) if self.cameras else 0)  # two that expose together differ
-        scene = Scene(SceneSpec(), seed)
+        scene = SimulatedScene(SceneSpec(), seed)
         genicam = read_genicam(settings.genicam) if settings.genicam is not None else None
         kind, has_flap = self._optics_of(name), "flap" in self.fakes
         picture = still(scene.render) if settings.still else scene.render

@@ -6,30 +6,129 @@ and undone by its `mended` one. A fault that cannot be undone (somebody pressed 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import heapq
+import itertools
+import json
+import re
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from difflib import get_close_matches
+from operator import attrgetter
 
 from pydantic import TypeAdapter
 
 from thermostand.drivers.sim.laboratory import Laboratory
-from thermostand.drivers.sim.laboratory_fault import Fault, Setter, flag, given, number, number_or_none, once, shown, to
-from thermostand.drivers.sim.link_faults import LINK_FAULTS, set_link_fault
 from thermostand.drivers.sim.motion.flap import ERROR_FEEDBACK_DISCONNECT, ERROR_HARD_OVER_CURRENT, ERROR_NO_POWER
 from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.motion.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
 from thermostand.drivers.sim.units.thermal_imager import SERIAL_NUMBER
+from thermostand.drivers.sim.wire import LINK_FAULTS, set_link_fault
 from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.errors import ConfigError
 
-_AXES = ("linear", "rotary")
+Setter = Callable[[Laboratory, object], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Breakage:
+    """How something is broken: by a value, `worst` when none is given; the one that mends it; what it means. `locks`:
+    set under the plant's lock; a wire that is unplugged waits for its thread, which may want that lock."""
+
+    apply: Setter
+    worst: object
+    mended: object
+    text: str
+    locks: bool = True
+
+
+def number(value: object) -> float:
+    """A value as given, 0 for none."""
+    return float(str(value or 0))
+
+
+def number_or_none(value: object) -> float | None:
+    """A value as given."""
+    return None if value is None else float(str(value))
+
+
+def to(path: str, kind: Callable[[object], object] = bool) -> Setter:
+    """Sets one attribute of one fake, by its path from the laboratory."""
+    owner, _, attribute = path.rpartition(".")
+
+    def apply(laboratory: Laboratory, value: object) -> None:
+        setattr(attrgetter(owner)(laboratory) if owner else laboratory, attribute, kind(value))
+
+    return apply
+
+
+def given(path: str, worst: float, text: str) -> Breakage:
+    """A number is given to a method of one fake, unless the value is none."""
+
+    def apply(laboratory: Laboratory, value: object) -> None:
+        if value is not None:
+            attrgetter(path)(laboratory)(float(str(value)))
+
+    return Breakage(apply, worst, None, text)
+
+
+def amount(path: str, worst: float, text: str) -> Breakage:
+    """One attribute of one fake is this number, 0 once it is mended."""
+    return Breakage(to(path, number), worst, 0.0, text)
+
+
+def held(path: str, worst: float, text: str) -> Breakage:
+    """One attribute of one fake is this number, None once it is mended."""
+    return Breakage(to(path, number_or_none), worst, None, text)
+
+
+def whole(path: str, worst: int, mended: int, text: str) -> Breakage:
+    """One attribute of one fake is this whole number."""
+    return Breakage(to(path, lambda value: int(number(value))), worst, mended, text)
+
+
+def flag(path: str, text: str) -> Breakage:
+    """One attribute of one fake is true."""
+    return Breakage(to(path), True, False, text)
+
+
+def shown(path: str, word: str, text: str) -> Breakage:
+    """One attribute of one fake is this word, None once it is mended."""
+    return Breakage(to(path, lambda value: word if value else None), True, False, text)
+
+
+@dataclass(frozen=True, slots=True)
+class Once:
+    """Something that happens when the fault is set, and is not undone."""
+
+    act: Callable[[Laboratory], None]
+
+    def __call__(self, laboratory: Laboratory, value: object) -> None:
+        """It happens, unless the value is none."""
+        if value:
+            self.act(laboratory)
+
+
+def once(path: str, text: str) -> Breakage:
+    """A method of one fake is called."""
+    return Breakage(Once(lambda laboratory: attrgetter(path)(laboratory)()), True, False, text)
+
+
+AXES = ("linear", "rotary")
 _AIR = "air"
 _ERRORS = {"feedback": ERROR_FEEDBACK_DISCONNECT, "power": ERROR_NO_POWER, "current": ERROR_HARD_OVER_CURRENT}
 
 
+def known_to(laboratory: Laboratory) -> dict[str, Breakage]:
+    """FAULTS, and those of the lines and axes that this laboratory has."""
+    return FAULTS | faults_of(laboratory.links, laboratory.axes)
+
+
 def inject(laboratory: Laboratory, name: str, value: object) -> None:
-    """Set one of FAULTS to `value`; KeyError, TypeError or ValueError when name or value is none."""
-    fault = FAULTS[name]
-    if not fault.locks:
-        return fault.apply(laboratory, value)
-    with laboratory.plant.lock:
+    """Set one of those known to it to `value`; KeyError, TypeError or ValueError when name or value is none."""
+    fault = known_to(laboratory)[name]
+    with laboratory.plant.lock if fault.locks else nullcontext():
         fault.apply(laboratory, value)
 
 
@@ -48,13 +147,15 @@ def _sensors(laboratory: Laboratory) -> dict[str, int]:
     return laboratory.spec.devices["thermometers"].settings["channels"]
 
 
-def _thermometers(attribute: str, kind: Callable[[Laboratory, object], object]) -> Setter:
+def sensors(attribute: str, kind: Callable[[Laboratory, object], object], worst: object, text: str) -> Breakage:
+    """One attribute of each module of thermometers."""
+
     def apply(laboratory: Laboratory, value: object) -> None:
         changed = kind(laboratory, value)
         for module in laboratory.thermometer_modules:
             setattr(module, attribute, changed)
 
-    return apply
+    return Breakage(apply, worst, None, text)
 
 
 def _exchange_probes(laboratory: Laboratory, value: object) -> None:
@@ -113,174 +214,148 @@ def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
         laboratory.camera.restart()
 
 
-def _axis_faults() -> Iterator[tuple[str, Fault]]:
-    """Every axis has the same."""
+def _its(attribute: str, kind: Callable[[object], object] = bool) -> Callable[[FakeAxis, object], None]:
+    return lambda axis, value: setattr(axis, attribute, kind(value))
 
-    def cycle(axis: FakeAxis, value: object) -> None:
-        if value:
-            axis.power_cycle()
 
-    def its(attribute: str, kind: Callable[[object], object]) -> Callable[[FakeAxis, object], None]:
-        return lambda axis, value: setattr(axis, attribute, kind(value))
+def _danger(bits: int) -> Callable[[FakeAxis, object], None]:
+    return lambda axis, value: setattr(axis, "danger", axis.danger & ~bits | (bits if value else 0))
 
-    def danger(bits: int) -> Callable[[FakeAxis, object], None]:
-        return lambda axis, value: setattr(axis, "danger", axis.danger & ~bits | (bits if value else 0))
 
-    faults: dict[str, tuple[Callable[[FakeAxis, object], None], object, object, str]] = {
-        "limit_hit": (
-            its("limit", lambda side: str(side or "")),
-            "right",
-            "",
-            "left or right: this switch reads closed",
-        ),
-        "wrong_limit": (its("wrong_limit", bool), True, False, "a stop at a switch is taken for the other one's"),
-        "lost_steps": (its("lost_steps", number), 200, 0, "steps by which the mechanics fall back, the count does not"),
-        "jam_steps": (its("stall_steps", number_or_none), 0, None, "steps beyond which the mechanics do not go"),
-        "ctp_error": (its("ctp_error", bool), True, False, "encoder and count differ"),
-        "overheated": (danger(FLAG_DRIVER_OVERHEAT), True, False, "the motor's driver is too warm"),
-        "winding": (danger(FLAG_WINDING_MISMATCH), True, False, "the windings differ"),
-        "endless": (its("endless", bool), True, False, "a move does not end"),
-        "motor_off": (its("motor_off", bool), True, False, "no current; the next move brings it back"),
-        "restart": (cycle, True, False, "off and on again: not homed, position 0"),
+# Kind -> what is done to the axis, worst value, the one that mends it, meaning.
+AXIS_FAULTS: dict[str, tuple[Callable[[FakeAxis, object], None], object, object, str]] = {
+    "limit_hit": (_its("limit", lambda side: str(side or "")), "right", "", "left or right: this switch reads closed"),
+    "wrong_limit": (_its("wrong_limit"), True, False, "a stop at a switch is taken for the other one's"),
+    "lost_steps": (_its("lost_steps", number), 200, 0, "steps by which the mechanics fall back, the count does not"),
+    "jam_steps": (_its("stall_steps", number_or_none), 0, None, "steps beyond which the mechanics do not go"),
+    "ctp_error": (_its("ctp_error"), True, False, "encoder and count differ"),
+    "overheated": (_danger(FLAG_DRIVER_OVERHEAT), True, False, "the motor's driver is too warm"),
+    "winding": (_danger(FLAG_WINDING_MISMATCH), True, False, "the windings differ"),
+    "endless": (_its("endless"), True, False, "a move does not end"),
+    "motor_off": (_its("motor_off"), True, False, "no current; the next move brings it back"),
+    "restart": (
+        lambda axis, value: axis.power_cycle() if value else None,
+        True,
+        False,
+        "off and on again: not homed, position 0",
+    ),
+}
+
+
+def _on_axis(name: str, act: Callable[[FakeAxis, object], None]) -> Setter:
+    return lambda laboratory, value: act(laboratory.axis(name), value)
+
+
+def _on_link(name: str, kind: str) -> Setter:
+    return lambda laboratory, value: set_link_fault(laboratory.link(name), kind, value)
+
+
+def faults_of(links: Iterable[str], axes: Iterable[str]) -> dict[str, Breakage]:
+    """Every link has the same, `bus.drop`, `linear.drop`, ..., and every axis, `linear.limit_hit`, ..."""
+    of_links = {
+        f"{name}.{kind}": Breakage(_on_link(name, kind), worst, mended, text, locks=False)
+        for name in links
+        for kind, (worst, mended, text) in LINK_FAULTS.items()
     }
-    for name in _AXES:
-        for kind, (act, worst, mended, text) in faults.items():
-
-            def apply(
-                laboratory: Laboratory,
-                value: object,
-                name: str = name,
-                act: Callable[[FakeAxis, object], None] = act,
-            ) -> None:
-                act(laboratory.axis(name), value)
-
-            yield f"{name}.{kind}", Fault(apply, worst, mended, text)
+    return of_links | {
+        f"{name}.{kind}": Breakage(_on_axis(name, act), worst, mended, text)
+        for name in axes
+        for kind, (act, worst, mended, text) in AXIS_FAULTS.items()
+    }
 
 
-def _link_faults() -> Iterator[tuple[str, Fault]]:
-    """Every link has the same, `bus.drop`, `linear.drop`, ..."""
-    for link in ("bus", "chamber", *_AXES):
-        for kind, (worst, mended, text) in LINK_FAULTS.items():
-
-            def apply(laboratory: Laboratory, value: object, link: str = link, kind: str = kind) -> None:
-                set_link_fault(
-                    laboratory.link("regulator" if link == "chamber" and link not in laboratory.fakes else link),
-                    kind,
-                    value,
-                )
-
-            yield f"{link}.{kind}", Fault(apply, worst, mended, text, locks=False)
-
-
-FAULTS: dict[str, Fault] = {
-    **dict(_link_faults()),
-    **dict(_axis_faults()),
+FAULTS: dict[str, Breakage] = {
+    **faults_of(("bus", "chamber", *AXES), AXES),
     # The regulator and its probe.
     "regulator.silent": flag("regulator.silent", "it does not answer"),
     "regulator.compoway": flag("regulator.compoway", "back to its own protocol"),
     "regulator.restart": once("regulator.power_cycle", "off and on again"),
     "regulator.sensor_break": flag("regulator.sensor_break", "open sensor"),
     "regulator.ad_error": flag("regulator.ad_error", "its converter has failed"),
-    "regulator.pv_offset_K": Fault(to("regulator.pv_offset_K", number), 5.0, 0.0, "it reads wrong"),
-    "regulator.stuck_pv_degC": Fault(to("regulator.stuck_pv_degC", number_or_none), 24.0, None, "its PV stays there"),
-    "regulator.pv_drift_K_per_h": Fault(to("regulator.pv_drift_K_per_h", number), 5.0, 0.0, "its PV drifts"),
+    "regulator.pv_offset_K": amount("regulator.pv_offset_K", 5.0, "it reads wrong"),
+    "regulator.stuck_pv_degC": held("regulator.stuck_pv_degC", 24.0, "its PV stays there"),
+    "regulator.pv_drift_K_per_h": amount("regulator.pv_drift_K_per_h", 5.0, "its PV drifts"),
     "regulator.probe_out": flag("regulator.probe_out", "its probe hangs in the laboratory"),
-    "regulator.probe_exchanged": Fault(_exchange_probes, True, False, "its probe with the air's thermometer"),
-    "regulator.set_point_degC": Fault(
-        given("regulator.press_setpoint"), 45.0, None, "somebody changes it with the keys"
-    ),
-    "regulator.set_point_clamp_degC": Fault(
+    "regulator.probe_exchanged": Breakage(_exchange_probes, True, False, "its probe with the air's thermometer"),
+    "regulator.set_point_degC": given("regulator.press_setpoint", 45.0, "somebody changes it with the keys"),
+    "regulator.set_point_clamp_degC": Breakage(
         _clamp_set_point, (15.0, 30.0), None, "[low, high]: it takes no set-point outside, and acknowledges it"
     ),
-    "regulator.acting_degC": Fault(
-        to("regulator.acting_degC", number_or_none), 45.0, None, "another set-point acts: multi-SP, or the remote one"
-    ),
-    "regulator.ramp_K_per_min": Fault(to("regulator.ramp_K_per_min", number_or_none), 0.5, None, "a ramp of its own"),
+    "regulator.acting_degC": held("regulator.acting_degC", 45.0, "another set-point acts: multi-SP, or the remote one"),
+    "regulator.ramp_K_per_min": held("regulator.ramp_K_per_min", 0.5, "a ramp of its own"),
     "regulator.stop_key": once("regulator.press_stop", "somebody stops control"),
-    "regulator.manual_percent": Fault(_press_manual, 50.0, None, "somebody dials in a heating output"),
-    "regulator.autotune": Fault(
+    "regulator.manual_percent": Breakage(_press_manual, 50.0, None, "somebody dials in a heating output"),
+    "regulator.autotune": Breakage(
         lambda lab, value: lab.regulator.press_autotune(bool(value)), True, False, "somebody starts it with the keys"
     ),
-    "regulator.decimals": Fault(
-        to("regulator.display_decimals", lambda value: int(number(value))), 0, 1, "its decimal point"
-    ),
+    "regulator.decimals": whole("regulator.display_decimals", 0, 1, "its decimal point"),
     # Contact thermometers; values by the channel's name.
-    "thermometer.open": Fault(_thermometers("open_channels", _channel), _AIR, None, "this one's wire is broken"),
-    "thermometer.shorted": Fault(_thermometers("shorted_channels", _channel), _AIR, None, "this one is shorted"),
-    "thermometer.pulled_out": Fault(
-        _thermometers("pulled_out", _channel), _AIR, None, "this one hangs in the laboratory"
-    ),
-    "thermometer.noisy": Fault(
-        _thermometers("noisy_channel", lambda lab, value: next(iter(_channel(lab, value)), None)),
+    "thermometer.open": sensors("open_channels", _channel, _AIR, "this one's wire is broken"),
+    "thermometer.shorted": sensors("shorted_channels", _channel, _AIR, "this one is shorted"),
+    "thermometer.pulled_out": sensors("pulled_out", _channel, _AIR, "this one hangs in the laboratory"),
+    "thermometer.noisy": sensors(
+        "noisy_channel",
+        lambda lab, value: next(iter(_channel(lab, value)), None),
         _AIR,
-        None,
         "this one has 1 K of noise",
     ),
-    "thermometer.offset_K": Fault(_thermometers("offset_K", _numbers), {_AIR: 5.0}, None, "{name: K}"),
-    "thermometer.drift_K_per_h": Fault(_thermometers("drift_K_per_h", _numbers), {_AIR: 2.0}, None, "{name: K/h}"),
-    "thermometer.stuck_degC": Fault(_thermometers("stuck_degC", _numbers), {_AIR: 24.0}, None, "{name: degC}"),
-    "thermometer.held_degC": Fault(
-        _thermometers("held_degC", _numbers), {_AIR: 24.0}, None, "{name: degC}, with the converter's noise"
-    ),
+    "thermometer.offset_K": sensors("offset_K", _numbers, {_AIR: 5.0}, "{name: K}"),
+    "thermometer.drift_K_per_h": sensors("drift_K_per_h", _numbers, {_AIR: 2.0}, "{name: K/h}"),
+    "thermometer.stuck_degC": sensors("stuck_degC", _numbers, {_AIR: 24.0}, "{name: degC}"),
+    "thermometer.held_degC": sensors("held_degC", _numbers, {_AIR: 24.0}, "{name: degC}, with the converter's noise"),
     "thermometers.silent": flag("thermometers.silent", "they do not answer"),
     "thermometers.no_fault_bits": flag("thermometers.no_fault_bits", "unreadable: their values are STALE"),
-    "thermometers.wrong_type": Fault(_wrong_module, True, False, "a module with another range"),
+    "thermometers.wrong_type": Breakage(_wrong_module, True, False, "a module with another range"),
     # A climate chamber with a controller of its own.
     "chamber.mute": flag("chamber.silent", "it does not answer"),
     "chamber.ignores_writes": flag("chamber.ignores_writes", "not in remote"),
     "chamber.protected": flag("chamber.protected", "the panel refuses (ESPEC)"),
     "chamber.clamps": flag("chamber.clamps", "it cuts set-points silently"),
-    "chamber.alarm": Fault(to("chamber.alarm", lambda value: str(value or "")), "31", "", "its code"),
+    "chamber.alarm": Breakage(to("chamber.alarm", lambda value: str(value or "")), "31", "", "its code"),
     "chamber.humidity": flag("chamber.humidity_on", "it is on"),
-    "chamber.stuck_degC": Fault(to("chamber.stuck_degC", number_or_none), 24.0, None, "its own sensor stays there"),
-    "chamber.set_point_degC": Fault(given("chamber.press_setpoint"), 45.0, None, "somebody changes it at the panel"),
-    "chamber.program_degC": Fault(
-        to("chamber.program_degC", number_or_none), 45.0, None, "a program of its own runs, and goes there"
-    ),
-    "chamber.bank": Fault(
-        to("chamber.bank", lambda value: int(number(value))), 1, 0, "working temperature that acts: 0 is T1 (Julabo)"
-    ),
+    "chamber.stuck_degC": held("chamber.stuck_degC", 24.0, "its own sensor stays there"),
+    "chamber.set_point_degC": given("chamber.press_setpoint", 45.0, "somebody changes it at the panel"),
+    "chamber.program_degC": held("chamber.program_degC", 45.0, "a program of its own runs, and goes there"),
+    "chamber.bank": whole("chamber.bank", 1, 0, "working temperature that acts: 0 is T1 (Julabo)"),
     "chamber.stop_key": once("chamber.press_stop", "somebody stops it"),
     "chamber.restart": once("chamber.restart", "a power failure: it is stopped"),
     # The plant, and the relays.
     "heater.cut_out": flag("plant.cut_out_open", "the thermal cut-out is open"),
-    "heater.welded_share": Fault(
+    "heater.welded_share": Breakage(
         to("ssr_welded_share", number), 1.0, None, "its solid-state relay conducts this share"
     ),
-    "inputs.changed": Fault(_change_contact, None, None, "name of a contact that is not as it is while all is well"),
+    "inputs.changed": Breakage(_change_contact, None, None, "name of a contact that is not as it is while all is well"),
     "relays.silent": flag("relays.silent", "the board does not answer"),
-    "relays.silent_s": Fault(_silent_relays, 60.0, 0, "for so long; its timed-on relays time out and drop"),
+    "relays.silent_s": Breakage(_silent_relays, 60.0, 0, "for so long; its timed-on relays time out and drop"),
     "relays.lost_writes": flag("relays.lost_writes", "acknowledged, not done"),
     "relays.brown_out": once("relays.power_cycle", "every relay opens"),
-    "relays.welded": Fault(
+    "relays.welded": Breakage(
         to("relays.welded", lambda value: {str(value)} if value else set[str]()),
         "heater_enable",
         None,
         "this contact conducts regardless of the coil",
     ),
-    "relays.no_rearm": Fault(
+    "relays.no_rearm": Breakage(
         to("relays.rearms", lambda value: not value),
         True,
         False,
         "a timed-on that runs does not start its time again",
     ),
-    "relays.no_timer": Fault(to("relays.times", lambda value: not value), True, False, "a timed-on stays on"),
+    "relays.no_timer": Breakage(to("relays.times", lambda value: not value), True, False, "a timed-on stays on"),
     # The analog output of a regulator of our own.
     "heat_module.silent": flag("heat_module.silent", "it does not answer"),
-    "heat_module.stuck_mA": Fault(
-        to("heat_module.stuck_mA", number_or_none), 12.0, None, "it gives this, whatever is written"
-    ),
+    "heat_module.stuck_mA": held("heat_module.stuck_mA", 12.0, "it gives this, whatever is written"),
     "heat_module.lost_writes": flag("heat_module.lost_writes", "writes to its outputs are acknowledged, not done"),
     "heat_module.restart": once("heat_module.power_cycle", "off and on again"),
-    "heat_module.refreshed_by": Fault(
+    "heat_module.refreshed_by": Breakage(
         to("heat_module.refreshed_by", str), "nothing", "requests", "what its watchdog is kept by"
     ),
-    "heat_module.written_mA": Fault(given("heat_module.write_mA"), 12.0, None, "another master writes this to it"),
+    "heat_module.written_mA": given("heat_module.write_mA", 12.0, "another master writes this to it"),
     # Axes by the name of the axis, as value.
-    "axis.alarm": Fault(_alarm_axis, "linear", None, "the alarm of this axis stands"),
+    "axis.alarm": Breakage(_alarm_axis, "linear", None, "the alarm of this axis stands"),
     # The flap.
-    "flap.jam": Fault(to("flap.jam_position", number_or_none), 2000, None, "feedback counts at which it stops"),
-    "flap.error": Fault(
+    "flap.jam": held("flap.jam_position", 2000, "feedback counts at which it stops"),
+    "flap.error": Breakage(
         to("flap.active_errors", lambda value: _ERRORS[str(value)] if value else 0),
         "feedback",
         None,
@@ -296,54 +371,190 @@ FAULTS: dict[str, Fault] = {
     "imager.cut": flag("imager.cut", "its files end too early; mended, they go on"),
     "imager.plain": flag("imager.plain", "pictures without temperatures"),
     "imager.damaged": flag("imager.damaged", "the counts lack their end"),
-    "imager.clock_s": Fault(to("imager.clock_s", number), 3600.0, 0.0, "its clock is ahead by this"),
-    "imager.serial_number": Fault(
+    "imager.clock_s": amount("imager.clock_s", 3600.0, "its clock is ahead by this"),
+    "imager.serial_number": Breakage(
         to("imager.serial_number", str), "49009999", SERIAL_NUMBER, "pictures of another imager"
     ),
     "imager.again": flag("imager.again", "the last picture under new names"),
     "imager.unplugged": flag("imager.unplugged", "its folder is gone"),
     # The camera that is named so, or the first.
-    "camera.loss": Fault(to("camera.faults.loss", number), 0.05, 0.0, "share of stream packets lost"),
-    "camera.burst": Fault(to("camera.faults.burst", lambda value: int(number(value))), 20, 1, "packets lost in a row"),
+    "camera.loss": amount("camera.faults.loss", 0.05, "share of stream packets lost"),
+    "camera.burst": whole("camera.faults.burst", 20, 1, "packets lost in a row"),
     "camera.no_resend": flag("camera.faults.no_resend", "nothing is sent again"),
     "camera.no_leader": flag("camera.faults.drop_leader", "frames lack it"),
     "camera.no_trailer": flag("camera.faults.drop_trailer", "frames lack it"),
     "camera.trigger_twice": flag("camera.faults.trigger_twice", "a trigger gives two frames"),
-    **{
-        f"camera.{name}": Fault(to(f"camera.faults.{name}", number), 0.05, 0.0, f"share of packets {text}")
-        for name, text in (("truncated", "cut in half"), ("doubled", "sent twice"), ("reordered", "sent late"))
-    },
-    "camera.leader_early_s": Fault(
-        to("camera.faults.leader_early_s", number), 0.4, 0.0, "leaders are so far ahead of the payload"
-    ),
-    "camera.stretch_s": Fault(to("camera.faults.stretch_s", number), 0.4, 0.0, "the payload takes so long"),
+    "camera.truncated": amount("camera.faults.truncated", 0.05, "share of packets cut in half"),
+    "camera.doubled": amount("camera.faults.doubled", 0.05, "share of packets sent twice"),
+    "camera.reordered": amount("camera.faults.reordered", 0.05, "share of packets sent late"),
+    "camera.leader_early_s": amount("camera.faults.leader_early_s", 0.4, "leaders are so far ahead of the payload"),
+    "camera.stretch_s": amount("camera.faults.stretch_s", 0.4, "the payload takes so long"),
     "camera.unpaced": flag("camera.faults.unpaced", "packets leave in one burst"),
     "camera.acks_twice": flag("camera.faults.acks_twice", "each answer twice"),
-    "camera.pending": Fault(to("camera.faults.pending", lambda value: int(number(value))), 3, 0, "answers are late"),
+    "camera.pending": whole("camera.faults.pending", 3, 0, "answers are late"),
     "camera.stamp_zero": shown("camera.faults.stamp", "zero", "its time stamps are 0"),
     "camera.stamp_backwards": shown("camera.faults.stamp", "backwards", "its time stamps run backwards"),
     "camera.no_ticks": flag("camera.faults.no_ticks", "its clock does not tick"),
-    "camera.silent": Fault(_silent_camera, True, False, "neither answers nor sends"),
+    "camera.silent": Breakage(_silent_camera, True, False, "neither answers nor sends"),
     "camera.stalled": flag("camera.faults.silent_gvsp", "answers, but sends no frame"),
     "camera.deaf": flag("camera.faults.silent_gvcp", "sends, but does not answer"),
-    "camera.control_lost": Fault(
+    "camera.control_lost": Breakage(
         lambda lab, value: lab.camera.seize(bool(value)), True, False, "another client has taken control of it"
     ),
     "camera.restart": once("camera.restart", "by itself, its supply on"),
-    "camera.no_stream_channel": Fault(_camera_without_stream, True, False, "it restarts, and does not offer one"),
-    "camera.sensor_degC": Fault(to("camera_sensor_degC", number_or_none), 75.0, None, "its sensor chip stays at this"),
+    "camera.no_stream_channel": Breakage(_camera_without_stream, True, False, "it restarts, and does not offer one"),
+    "camera.sensor_degC": held("camera_sensor_degC", 75.0, "its sensor chip stays at this"),
     "camera.frozen_temperature": shown("camera.faults.temperature", "stuck", "it keeps showing the last one"),
     "camera.no_temperature": shown("camera.faults.temperature", "zero", "it shows 0 degC"),
     "camera.refused_temperature": shown("camera.faults.temperature", "access", "its register cannot be read"),
-    "camera.temperature_offset_K": Fault(
-        to("camera.faults.temperature_offset_K", number), 10.0, 0.0, "it shows a wrong one"
-    ),
+    "camera.temperature_offset_K": amount("camera.faults.temperature_offset_K", 10.0, "it shows a wrong one"),
 }
 
 
-def table() -> list[dict[str, object]]:
-    """FAULTS for people and programs: name, worst, mended, text."""
+def table(known: Mapping[str, Breakage] = FAULTS) -> list[dict[str, object]]:
+    """Faults for people and programs: name, worst, mended, text."""
     return [
         {"name": name, "worst": fault.worst, "mended": fault.mended, "text": fault.text}
-        for name, fault in sorted(FAULTS.items())
+        for name, fault in sorted(known.items())
     ]
+
+
+# Faults in advance: what breaks when, and for how long, in one line of text each.
+#
+#     NAME[=VALUE][@TIME][:DURATION]        bus.drop=0.1@20min:60     flap.jam     thermometer.offset_K={"air": 3}@2h
+#
+# TIME counts from the laboratory's start, DURATION from then on; both in s unless they end in s, min or h. Without TIME
+# it breaks at once, without DURATION it stays broken, without VALUE it breaks as badly as the table says.
+
+
+_TIME = r"(\d+(?:\.\d+)?)(s|min|h)?"
+_FORM = re.compile(rf"([A-Za-z_]+\.[A-Za-z_]+)(?:=(.+?))?(?:@{_TIME})?(?::{_TIME})?")
+_SECONDS = {None: 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFault:
+    """`name` has `value` from at_s after the start on, for for_s; None for good."""
+
+    name: str
+    value: object
+    at_s: float = 0.0
+    for_s: float | None = None
+
+
+def parse_fault(text: str, known: Mapping[str, Breakage] = FAULTS) -> PlannedFault:
+    """One line of text; ConfigError when it is none, or names none of the faults that are known."""
+    found = _FORM.fullmatch(text.strip())
+    if found is None:
+        raise ConfigError(f"fault {text!r}: expected NAME[=VALUE][@TIME][:DURATION], such as bus.drop=0.1@20min:60")
+    name, value, at, at_unit, length, length_unit = found.groups()
+    if name not in known:
+        near = get_close_matches(name, known, n=3, cutoff=0.4)
+        hint = f"did you mean {', '.join(near)}?" if near else "`stand simulate --faults` lists them"
+        raise ConfigError(f"fault {text!r}: there is no {name}; {hint}")
+    at_s = float(at) * _SECONDS[at_unit] if at else 0.0
+    for_s = float(length) * _SECONDS[length_unit] if length else None
+    return PlannedFault(name, known[name].worst if value is None else _value(value), at_s, for_s)
+
+
+def _value(text: str) -> object:
+    """A number, true, false or an object as JSON, else the text itself."""
+    try:
+        value: object = json.loads(text)
+    except ValueError:
+        return text
+    return value
+
+
+class FaultSchedule:
+    """Breaks and mends a laboratory, as planned or by hand. `advance` leads virtual time, `tick` follows real time."""
+
+    def __init__(self, laboratory: Laboratory, faults: Iterable[PlannedFault]) -> None:
+        """Breaks what is due at the start; ConfigError when this laboratory cannot have what is planned, then or later:
+        each is tried and mended again, but for what happens in an instant and leaves its traces."""
+        self._laboratory = laboratory
+        self.known = known_to(laboratory)
+        self._lock = threading.Lock()
+        self._due: list[tuple[int, int, str, object]] = []
+        self._number = itertools.count()
+        self._ends: dict[str, int] = {}  # the number of the end of what was broken by hand
+        self._standing: dict[str, object] = {}
+        start_ns = laboratory.now_ns
+        for planned in faults:
+            if planned.at_s > 0 and not isinstance(self.known[planned.name].apply, Once):
+                self._set(planned.name, planned.value)
+                self._set(planned.name, self.known[planned.name].mended)
+            at_ns = start_ns + seconds_ns(planned.at_s)
+            self._push(at_ns, planned.name, planned.value)
+            if planned.for_s is not None:
+                self._push(at_ns + seconds_ns(planned.for_s), planned.name, self.known[planned.name].mended)
+        self._break_until(start_ns)
+
+    def standing(self) -> dict[str, object]:
+        """What is broken now, with its value; what just happens (a restart) is not."""
+        with self._lock:
+            return dict(self._standing)
+
+    def break_now(self, name: str, value: object, for_s: float | None) -> None:
+        """By hand; None: until it is mended. ConfigError when there is no such fault, or this laboratory cannot have
+        it. The end of one that was broken by hand before is forgotten."""
+        if name not in self.known:
+            raise ConfigError(f"there is no fault {name}")
+        with self._lock:
+            self._set(name, value)
+            self._forget_end(name)
+            if for_s is not None:
+                self._ends[name] = self._push(
+                    self._laboratory.now_ns + seconds_ns(for_s), name, self.known[name].mended
+                )
+
+    def mend(self, name: str) -> None:
+        """By hand; ConfigError as in `break_now`."""
+        if name not in self.known:
+            raise ConfigError(f"there is no fault {name}")
+        with self._lock:
+            self._set(name, self.known[name].mended)
+            self._forget_end(name)
+
+    def advance(self, now_ns: int) -> None:
+        """Virtual time moves to `now_ns`, with every change at its own instant; ValueError in real time, ConfigError as
+        in `tick`."""
+        with self._lock:
+            while self._due and self._due[0][0] <= now_ns:
+                self._laboratory.advance(max(self._due[0][0], self._laboratory.now_ns))
+                self._change()
+            self._laboratory.advance(now_ns)
+
+    def tick(self) -> None:
+        """In real time: what has become due; ConfigError when this laboratory cannot have it."""
+        if not self._laboratory.is_virtual:
+            with self._lock:
+                self._break_until(self._laboratory.now_ns)
+
+    def _break_until(self, now_ns: int) -> None:
+        while self._due and self._due[0][0] <= now_ns:
+            self._change()
+
+    def _push(self, at_ns: int, name: str, value: object) -> int:
+        number = next(self._number)
+        heapq.heappush(self._due, (at_ns, number, name, value))
+        return number
+
+    def _forget_end(self, name: str) -> None:
+        if (number := self._ends.pop(name, None)) is not None:
+            self._due = [due for due in self._due if due[1] != number]
+            heapq.heapify(self._due)
+
+    def _change(self) -> None:
+        _, _, name, value = heapq.heappop(self._due)
+        self._set(name, value)
+
+    def _set(self, name: str, value: object) -> None:
+        try:
+            inject(self._laboratory, name, value)
+        except (ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"fault {name}={json.dumps(value)}: this laboratory cannot have it ({error})") from error
+        if value == self.known[name].mended or isinstance(self.known[name].apply, Once):
+            self._standing.pop(name, None)
+        else:
+            self._standing[name] = value

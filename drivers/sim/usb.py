@@ -26,8 +26,7 @@ from typing import Protocol
 from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
 
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import Lines, TcpWire
+from thermostand.drivers.sim.wire import LineEngine, LinkFaults, TcpWire
 from thermostand.foundation.addresses import tcp_place
 
 GET_DESCRIPTOR_IN, GET_DESCRIPTOR, STRING_DESCRIPTOR = 0x80, 6, 3
@@ -62,7 +61,7 @@ class TimedOut(TransferFailed):
     code = TIMEOUT
 
 
-class UsbDevice(Protocol):
+class FakeUsbDevice(Protocol):
     """What the server asks of a fake device. `address` changes when it is plugged in again; `strings` are its string
     descriptors: 1 manufacturer, 2 product, 3 serial number."""
 
@@ -91,9 +90,9 @@ class UsbDevice(Protocol):
 class UsbServer:
     """The simulator's end: lists the plugged-in `devices` and carries control transfers to them."""
 
-    def __init__(self, host: str, port: int, devices: Sequence[UsbDevice]) -> None:
+    def __init__(self, host: str, port: int, devices: Sequence[FakeUsbDevice]) -> None:
         self._devices = devices
-        self._wire = TcpWire(host, port, lambda: Lines(self._answer), LinkFaults())
+        self._wire = TcpWire(host, port, lambda: LineEngine(self._answer), LinkFaults())
         self.port, self.address = self._wire.port, self._wire.address
 
     def close(self) -> None:
@@ -143,7 +142,7 @@ class _Gone(TransferFailed):
     code = NO_DEVICE
 
 
-def _string(device: UsbDevice, index: int) -> bytes:
+def _string(device: FakeUsbDevice, index: int) -> bytes:
     """A string descriptor, USB 2.0 section 9.6.7."""
     if index == 0:
         return LANGUAGES

@@ -9,17 +9,109 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import random
 import select
 import shutil
 import socket
 import tempfile
 import threading
+import time
 import tty
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from thermostand.drivers.sim.faults import LinkFaults
+# How to break a link: byte-level faults between a fake's protocol engine and its descriptor.
+
+
+@dataclass
+class LinkFaults:
+    """What happens to replies on one wire. Probabilities are 0..1 per reply; seeded, so that a run repeats.
+
+    silent: no reply leaves. drop, flip, cut, junk: probabilities of losing the reply, flipping one bit, sending only
+    its first half, sending 7 random bytes before it; late: of sending it late_by_s late. delay_s: real seconds of
+    lateness of every reply (a wire time, not a simulated one); late_s: of the next one alone. garbled: how many of the
+    coming replies lose their second half. echo: the request comes back before the reply (a badly wired RS-485
+    adapter). byte_by_byte: one write a byte. flow_control: XOFF and XON among the reply. Over TCP: hangs_up: each
+    connection is closed after one reply; swallows_first: the first request over each is lost. `injected` counts what
+    was done, by name.
+    """
+
+    seed: int = 0
+    silent: bool = False
+    drop: float = 0.0
+    flip: float = 0.0
+    cut: float = 0.0
+    junk: float = 0.0
+    delay_s: float = 0.0
+    late_s: float = 0.0
+    late: float = 0.0
+    late_by_s: float = 0.5
+    garbled: int = 0
+    echo: bool = False
+    byte_by_byte: bool = False
+    flow_control: bool = False
+    hangs_up: bool = False
+    swallows_first: bool = False
+    injected: dict[str, int] = field(default_factory=dict[str, int])
+
+    def __post_init__(self) -> None:
+        self._random = random.Random(self.seed)
+
+    def apply(self, request: bytes, reply: bytes) -> list[bytes]:
+        """The pieces to write instead of `reply`; may wait delay_s first. Nothing when there was no reply."""
+        if not reply:
+            return []
+        if self._is_sound:
+            return [reply]
+        if self.delay_s > 0:
+            self._count("delay")
+            time.sleep(self.delay_s)  # noqa: TID251 - a slow line is slow in real seconds
+        if self.late_s > 0:
+            late_s, self.late_s = self.late_s, 0.0
+            self._count("late")
+            time.sleep(late_s)  # noqa: TID251 - as above
+        if self._chance(self.late, "late"):
+            time.sleep(self.late_by_s)  # noqa: TID251 - as above
+        if self.garbled > 0:
+            self.garbled -= 1
+            self._count("garbled")
+            return [reply[: max(1, len(reply) // 2)]]
+        if self.silent or self._chance(self.drop, "drop"):
+            return []
+        if self._chance(self.flip, "flip"):
+            position = self._random.randrange(len(reply))
+            reply = (
+                reply[:position] + bytes([reply[position] ^ (1 << self._random.randrange(8))]) + reply[position + 1 :]
+            )
+        if self._chance(self.cut, "cut"):
+            reply = reply[: max(1, len(reply) // 2)]
+        if self._chance(self.junk, "junk"):
+            reply = self._random.randbytes(7) + reply
+        if self.echo:
+            self._count("echo")
+            reply = request + reply
+        if self.flow_control:
+            self._count("flow_control")
+            reply = b"\x13" + reply[:2] + b"\x11" + reply[2:] + b"\x13\x11"
+        return [bytes([byte]) for byte in reply] if self.byte_by_byte else [reply]
+
+    @property
+    def _is_sound(self) -> bool:
+        probable = self.drop or self.flip or self.cut or self.junk or self.late
+        other = self.silent or self.delay_s or self.late_s or self.garbled or self.echo or self.byte_by_byte
+        other = other or self.flow_control
+        return not (probable or other)
+
+    def _chance(self, probability: float, name: str) -> bool:
+        if probability <= 0 or self._random.random() >= probability:
+            return False
+        self._count(name)
+        return True
+
+    def _count(self, name: str) -> None:
+        self.injected[name] = self.injected.get(name, 0) + 1
 
 
 class Engine(Protocol):
@@ -30,7 +122,7 @@ class Engine(Protocol):
         ...
 
 
-class Lines:
+class LineEngine:
     """An engine for requests of one line each: `answer(line) -> line`, both without their line feed."""
 
     def __init__(self, answer: Callable[[bytes], bytes]) -> None:
@@ -187,3 +279,56 @@ class TcpWire:
         for connection in connections:
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
+
+
+# The faults that every byte link has: names, worst values, and how each is set on its wire.
+
+
+_MIXED = ("drop", "flip", "cut", "junk", "late")
+
+# Kind -> worst value, the one that mends it, meaning.
+LINK_FAULTS: dict[str, tuple[object, object, str]] = {
+    "silent": (True, False, "no reply leaves"),
+    "drop": (0.05, 0.0, "share of replies lost"),
+    "flip": (0.05, 0.0, "share of replies with one bit flipped"),
+    "cut": (0.05, 0.0, "share of replies of which only the first half comes"),
+    "junk": (0.05, 0.0, "share of replies with 7 random bytes before them"),
+    "late": (0.05, 0.0, "share of replies that come 0.5 s late"),
+    "mixed": (0.05, 0.0, "share of replies that are dropped, flipped, cut, late or have junk before them"),
+    "delay_s": (0.2, 0.0, "every reply is slow by so many real seconds"),
+    "late_s": (1.0, 0.0, "the next reply is late by so many real seconds"),
+    "garbled": (3, 0, "so many of the coming replies lose their second half"),
+    "echo": (True, False, "the request comes back before the reply"),
+    "byte_by_byte": (True, False, "one write a byte"),
+    "flow_control": (True, False, "XOFF and XON come among the replies"),
+    "hangs_up": (True, False, "over TCP: each connection is closed after one reply"),
+    "swallows_first": (True, False, "over TCP: the first request over each connection is lost"),
+    "unplugged": (True, False, "connections are cut, and nobody listens; plugged in again by another port"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FaultyLink:
+    """One wire and what breaks its replies."""
+
+    wire: PtyWire | TcpWire
+    faults: LinkFaults
+
+
+def set_link_fault(link: FaultyLink, kind: str, value: object) -> None:
+    """One of LINK_FAULTS; must not be called under a lock that the wire's thread may want."""
+    match kind:
+        case "unplugged":
+            if value:
+                link.wire.unplug()
+            else:
+                link.wire.plug()
+        case "mixed":
+            for each in _MIXED:
+                setattr(link.faults, each, float(str(value or 0)) / len(_MIXED))
+        case "silent" | "echo" | "byte_by_byte" | "flow_control" | "hangs_up" | "swallows_first":
+            setattr(link.faults, kind, bool(value))
+        case "garbled":
+            link.faults.garbled = int(str(value or 0))
+        case _:
+            setattr(link.faults, kind, float(str(value or 0)))

@@ -23,8 +23,7 @@ from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_si
 from tests.compensation.rendered import Scene, render, shaded_light
 from tests.recording.stored import stored
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
-from thermostand.drivers.sim.physics.scene import Scene as SimulatedScene
-from thermostand.drivers.sim.physics.scene import SceneSpec
+from thermostand.drivers.sim.physics.scene import SceneSpec, SimulatedScene
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.readings import Frame
 from thermostand.markers.target import load_target

@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.gige.camera import FakeCamera, HEIGHT_px, WIDTH_px
 from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine
 from thermostand.drivers.sim.units.regulator import FakeRegulator
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.foundation.clock import WallClock
 
 Close = Callable[[], None]

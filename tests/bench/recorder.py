@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tests.bench.figures import Figure, at_most, in_turns, progress, ratio_at_least, side_by_side
 from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
-from thermostand.drivers.sim.physics.scene import Scene, SceneSpec
+from thermostand.drivers.sim.physics.scene import SceneSpec, SimulatedScene
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.images import ZSTD_LEVEL, FrameEncoding
@@ -36,7 +36,9 @@ START_NS = 1_767_290_400 * NS_PER_S
 
 def figures(directory: Path) -> list[Figure]:
     """ms per compressed frame and its size, and MB/s of raw frames."""
-    image = Scene(SceneSpec(), 1).render(Plant(PlantSpec(), START_NS).optics(START_NS), START_NS, 0.1, 0.0, 1.0)
+    image = SimulatedScene(SceneSpec(), 1).render(
+        Plant(PlantSpec(), START_NS).optics(START_NS), START_NS, 0.1, 0.0, 1.0
+    )
     return [*_zstd(directory, image), _raw(directory, image)]
 
 

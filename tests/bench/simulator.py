@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.bench.figures import Figure, absolute, milliseconds, progress
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec, STEP_ns
-from thermostand.drivers.sim.physics.scene import Scene, SceneSpec
+from thermostand.drivers.sim.physics.scene import SceneSpec, SimulatedScene
 from thermostand.drivers.sim.units.regulator import FakeRegulator
 from thermostand.drivers.sim.units.relays import FakeRelays
 from thermostand.foundation.clock import NS_PER_S, FollowedClock
@@ -23,7 +23,7 @@ def figures(directory: Path) -> list[Figure]:
 
 
 def _scene() -> Figure:
-    scene, optics = Scene(SceneSpec(), 1), Plant(PlantSpec(), START_NS).optics(START_NS)
+    scene, optics = SimulatedScene(SceneSpec(), 1), Plant(PlantSpec(), START_NS).optics(START_NS)
     times_ms = [
         milliseconds(lambda number=number: scene.render(optics, START_NS + number, 0.1, 0.0, 1.0))
         for number in range(ROUNDS + 1)

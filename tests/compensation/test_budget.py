@@ -85,8 +85,8 @@ def test_the_correction_takes_out_what_the_simulated_stand_does():
     geometry = PAPER.model_copy(update={"target_per_K": PAPER.target_per_K.model_copy(update={"value": 9.0e-6})})
     cool_nodes = optics.Nodes(24.0, 24.0, 24.0, 24.0, 24.0, 24.0)
     warm_nodes = replace(cool_nodes, granite_inside_degC=50.0, granite_outside_degC=27.0, artifact_degC=25.5)
-    cool = optics.optics_at("modified", cool_nodes, optics.Placement())
-    warm = optics.optics_at("modified", warm_nodes, optics.Placement())
+    cool = optics.optics_at("modified", cool_nodes, optics.StandPlacement())
+    warm = optics.optics_at("modified", warm_nodes, optics.StandPlacement())
     stand_only = replace(
         cool,
         camera_shift_mm=warm.camera_shift_mm,

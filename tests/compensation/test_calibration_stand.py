@@ -11,7 +11,7 @@ from thermostand.compensation.calibration.model_scores import rays_of
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma
-from thermostand.drivers.sim.physics.optics import Nodes, Optics, Placement, optics_at, true_centres_px
+from thermostand.drivers.sim.physics.optics import Nodes, Optics, StandPlacement, optics_at, true_centres_px
 from thermostand.markers.target import load_target
 from thermostand.stand.config.stand_config import packaged
 
@@ -22,7 +22,7 @@ VALIDATION = ((70.0, 0.0), (95.0, 8.0), (10.0, -20.0), (140.0, 22.0))
 
 
 def optics(linear_mm: float, rotary_deg: float) -> Optics:
-    return optics_at("modified", WARM, Placement(linear_mm=linear_mm, rotary_deg=rotary_deg))
+    return optics_at("modified", WARM, StandPlacement(linear_mm=linear_mm, rotary_deg=rotary_deg))
 
 
 def recipe_places() -> np.ndarray:

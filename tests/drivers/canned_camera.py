@@ -8,9 +8,8 @@ from contextlib import suppress
 from tests.drivers.canned_line import Feed, Parser
 from tests.sim.gvcp_client import decode_ack, decode_leader
 from thermostand.drivers.sim.gige import gvcp, gvsp
-from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Registers
 from thermostand.drivers.sim.gige.genicam import features
-from thermostand.drivers.sim.gige.gvcp_device import ControlChannel
 
 _MEMORY, _MEMORY_SIZE = 0x10000, 0x400  # of the features
 _PEER = ("127.0.0.1", 40001)
@@ -64,8 +63,8 @@ def gvcp_commands() -> Parser:
                 return wire[2:4] == b"\x00\x40"
             ack = decode_ack(answer)
             assert (ack.command, ack.req_id) == struct.unpack_from(">H2xH", wire, 2)
-            assert ack.status == gvcp.Status.OK or ack.payload == b""
-            return ack.status == gvcp.Status.OK
+            assert ack.status == gvcp.GvcpStatus.OK or ack.payload == b""
+            return ack.status == gvcp.GvcpStatus.OK
 
         return feed
 

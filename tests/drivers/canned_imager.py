@@ -7,11 +7,11 @@ import numpy as np
 from tests.drivers.canned_line import Feed, Parser
 from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
 from thermostand.drivers.devices.imager.radiometry import temperatures_degC
-from thermostand.drivers.sim.units.radiometric import Shot, counts_of, jpeg_of
+from thermostand.drivers.sim.units.thermal_imager import RadiometricShot, counts_of, jpeg_of
 
 _SCENE_DEGC = np.linspace(10.0, 50.0, 64).reshape(8, 8)
 _SPOTS = {"lens": (3, 4), "1": (5, 5)}
-_SHOTS = [Shot(_SCENE_DEGC, 1.7e9, spots=_SPOTS, png=png, emissivity=0.95) for png in (False, True)]
+_SHOTS = [RadiometricShot(_SCENE_DEGC, 1.7e9, spots=_SPOTS, png=png, emissivity=0.95) for png in (False, True)]
 
 
 def radiometric() -> Parser:

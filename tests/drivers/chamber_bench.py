@@ -13,12 +13,16 @@ from pydantic import TypeAdapter
 
 from thermostand.drivers.devices.chambers.chamber_language import ChamberUnitSettings
 from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamber, ClimateChamberSettings
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
-from thermostand.drivers.sim.units.climate_chambers import FakeClimateChamber, FakeCts, FakeEspec, FakeWeiss
-from thermostand.drivers.sim.units.julabo_circulator import FakeJulabo
-from thermostand.drivers.sim.units.simserv_chamber import FakeSimserv
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.units.climate_chambers import (
+    FakeClimateChamber,
+    FakeCts,
+    FakeEspec,
+    FakeJulabo,
+    FakeSimserv,
+    FakeWeiss,
+)
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.foundation.clock import Clock, FollowedClock, WallClock, seconds_ns
 from thermostand.foundation.readings import Reading

@@ -17,8 +17,7 @@ from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import SimDevice
 
 from tests.drivers.bus_responder import TIMEOUT_S, Responder
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import PtyWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.foundation.clock import WallClock
 

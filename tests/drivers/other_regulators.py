@@ -9,15 +9,13 @@ these are for the wire, not for how well they control.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
-    Refusal,
-    Timeline,
-    answer,
+    BusUnit,
+    ModbusRefusal,
     reads_words,
     writes_one,
     writes_words,
@@ -29,13 +27,6 @@ REMOTE_FALLS_BACK_s = 10.0  # how long a remote set point lives unless it is wri
 AUTOMATIC, MANUAL, OFF = 10, 54, 62  # Watlow's words
 DEGC, DEGF = 15, 30
 NO, YES = 59, 106
-
-
-class Chamber(Timeline, Protocol):
-    """What a regulator sees and moves of the plant."""
-
-    heater_on_fraction: float
-    chamber_degC: float
 
 
 def float_words(value: float) -> list[int]:
@@ -50,34 +41,19 @@ def _words_float(words: Sequence[int]) -> float:
     return float(value)
 
 
-class _Regulator:
+class _Regulator(BusUnit):
     """What they share: the wire, the probe, the output. `silent`; `stuck_pv_degC`; `eeprom_writes`."""
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
-        self.unit = unit
-        self.silent = False
+    def __init__(self, plant: Plant, clock: Now, unit: int) -> None:
+        super().__init__(plant, clock, unit)
         self.stuck_pv_degC: float | None = None
         self.eeprom_writes = 0
-        self._plant = plant
-        self._clock = clock
-        self._functions = {
+        self.functions = {
             0x03: reads_words(self._read_words),
             0x06: writes_one(self._write_one),
             0x10: writes_words(self._write_words),
         }
         plant.on_step.append(self._on_step)
-
-    def handle(self, pdu: bytes) -> bytes | None:
-        """The reply to a request."""
-        with self._now():
-            return None if self.silent else answer(pdu, self._functions)
-
-    @contextmanager
-    def _now(self) -> Generator[None]:
-        with self._plant.lock:
-            self._now_ns = self._clock.now_ns()
-            self._plant.advance(self._now_ns)
-            yield
 
     def _read_words(self, address: int, count: int) -> list[int]:
         return [self._word(each) for each in range(address, address + count)]
@@ -113,7 +89,7 @@ class FakeEurotherm(_Regulator):
     automatic had. Faults: rate_K_per_min (a ramp of its own); sensor_break; loop_break; lost (the next write to this
     register never arrives)."""
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
+    def __init__(self, plant: Plant, clock: Now, unit: int) -> None:
         super().__init__(plant, clock, unit)
         self.local_degC = 20.0
         self.sensor_break = False
@@ -177,7 +153,7 @@ class FakeEurotherm(_Regulator):
 
     def _write_words(self, address: int, words: Sequence[int]) -> None:
         if len(words) != 1:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         value = words[0] - 0x10000 if words[0] & 0x8000 else words[0]
         match address:
             case 2 | 24:
@@ -193,7 +169,7 @@ class FakeEurotherm(_Regulator):
             case 276:
                 self._remote_selected = bool(value)
             case _:
-                raise Refusal(ILLEGAL_ADDRESS)
+                raise ModbusRefusal(ILLEGAL_ADDRESS)
 
 
 class _Watlow(_Regulator):
@@ -202,7 +178,7 @@ class _Watlow(_Regulator):
 
     MODE, SETPOINT, OUTPUT, PV = 0, 0, 0, 0
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
+    def __init__(self, plant: Plant, clock: Now, unit: int) -> None:
         super().__init__(plant, clock, unit)
         self.mode = OFF
         self.setpoint_degC = 24.0
@@ -240,7 +216,7 @@ class _Watlow(_Regulator):
         elif address == self.MODE and len(words) == 1 and words[0] in (AUTOMATIC, MANUAL, OFF):
             self.mode = words[0]
         else:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
 
 
 class FakeEzZone(_Watlow):
@@ -248,7 +224,7 @@ class FakeEzZone(_Watlow):
 
     MODE, SETPOINT, OUTPUT, PV = 1880, 2160, 1904, 360
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
+    def __init__(self, plant: Plant, clock: Now, unit: int) -> None:
         super().__init__(plant, clock, unit)
         self.comms_unit = DEGF
 
@@ -278,7 +254,7 @@ class FakeBinder(_Watlow):
     MODE, SETPOINT, PV = 0x1A22, 0x1581, 0x11A9
     IDLE, BY_HAND = 0, 0x0800
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
+    def __init__(self, plant: Plant, clock: Now, unit: int) -> None:
         super().__init__(plant, clock, unit)
         self.mode = self.IDLE
         self.door_open = False

@@ -14,8 +14,7 @@ import pytest
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from tests.drivers.bus_responder import TIMEOUT_S, Fault, Responder, flip, frame, late, read_is_right
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import PtyWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable

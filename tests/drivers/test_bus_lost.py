@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.drivers.bus_responder import TIMEOUT_S, Fault, Responder, flip, frame, late, read_is_right
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.foundation.clock import VirtualClock, WallClock, seconds_ns
 from thermostand.foundation.errors import GarbledReply, Unreachable

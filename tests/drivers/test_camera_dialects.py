@@ -4,7 +4,6 @@ ones (27 of 12 makes: etc/genicam of the public repository areaDetector/aravisGi
 
 import asyncio
 import os
-import threading
 from collections.abc import Generator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -31,14 +30,14 @@ from tests.dialects import (
     integer,
     register,
 )
+from tests.still_plant import StillPlant
 from tests.system.conftest import require_aravis
 from thermostand.drivers.devices.cameras.camera_gige import Camera
 from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, AravisError
 from thermostand.drivers.sim.gige.camera import FakeCamera
-from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Registers
 from thermostand.drivers.sim.gige.genicam_file import GenicamFile, read_genicam
-from thermostand.drivers.sim.gige.gvcp import Ack, Nack, Request, Status
-from thermostand.drivers.sim.gige.gvcp_device import ControlChannel
+from thermostand.drivers.sim.gige.gvcp import Ack, GvcpRequest, GvcpStatus, Nack
 from thermostand.drivers.wires import camera_connection
 from thermostand.drivers.wires.aravis import GigeDevice
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
@@ -52,17 +51,6 @@ BITS |= {"Mono10p": 10, "Mono12p": 12}
 FOLDER = os.environ.get("GENICAM", "")
 
 
-class Plant:
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.sensor_degC, self.body_degC = 41.5, 33.0
-        self.camera_powered = True
-        self.camera_power_on_ns: int | None = 0
-
-    def advance(self, now_ns: int) -> None:
-        pass
-
-
 def scene(rows: int, width: int) -> NDArray[np.uint8]:
     y, x = np.mgrid[:rows, :width]
     return ((x + 3 * y) % 251).astype(np.uint8)
@@ -74,7 +62,7 @@ def dressed(file: GenicamFile | None, size_px: tuple[int, int] = (WIDTH, HEIGHT)
         return scene(rows, size_px[0])
 
     camera = FakeCamera(
-        Plant(),
+        StillPlant(0, sensor=41.5, body=33.0),
         WallClock(),
         render,
         usual_camera_address(),
@@ -182,7 +170,7 @@ async def test_a_selector_that_the_camera_refuses_costs_the_temperature_and_not_
 
         def refusing(address: int, count: int) -> bytes:
             if address == 0xA0B0:
-                raise Nack(Status.ACCESS_DENIED, "not now")
+                raise Nack(GvcpStatus.ACCESS_DENIED, "not now")
             return read(address, count)
 
         monkeypatch.setattr(registers, "read", refusing)
@@ -202,7 +190,7 @@ async def test_a_selector_that_the_camera_never_answers_for_costs_the_temperatur
     execute = ControlChannel._execute  # pyright: ignore[reportPrivateUsage] - it is heard, and not answered
     is_silent = True
 
-    def unanswered(self: ControlChannel, request: Request, peer: tuple[str, int], now_s: float) -> Ack | None:
+    def unanswered(self: ControlChannel, request: GvcpRequest, peer: tuple[str, int], now_s: float) -> Ack | None:
         is_asked = request.payload[:4] == (0xA0A0).to_bytes(4, "big")
         return None if is_asked and is_silent else execute(self, request, peer, now_s)
 

@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from thermostand.drivers.sim.gige.camera_registers import Registers
+from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Registers
 from thermostand.drivers.sim.gige.genicam import features
-from thermostand.drivers.sim.gige.gvcp import Command, Request
-from thermostand.drivers.sim.gige.gvcp_device import ControlChannel
+from thermostand.drivers.sim.gige.gvcp import GvcpCommand, GvcpRequest
 from thermostand.drivers.wires.discovery import GVCP_PORT, FoundCamera, cameras_at, decode_answer, usb_devices
 from thermostand.stand.commands.command_table import app
 
@@ -31,7 +30,7 @@ def channel() -> ControlChannel:
 
 
 def answer() -> bytes:
-    return channel().feed(Request(Command.DISCOVERY, 0xFFFF).encode(), ("127.0.0.1", 4), 0.0) or b""
+    return channel().feed(GvcpRequest(GvcpCommand.DISCOVERY, 0xFFFF).encode(), ("127.0.0.1", 4), 0.0) or b""
 
 
 class Answering(asyncio.DatagramProtocol):

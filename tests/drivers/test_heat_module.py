@@ -10,12 +10,11 @@ import pytest
 from pydantic import ValidationError
 
 from thermostand.drivers.devices.regulators.heat_module import HeatModule, HeatModuleSettings
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units import heat_module as fake_module
 from thermostand.drivers.sim.units.heat_module import TRIPPED, FakeHeatModule
 from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
-from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
 from thermostand.drivers.wires.registers import RegisterMap, load_register_map

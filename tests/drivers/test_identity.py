@@ -12,12 +12,11 @@ from thermostand.drivers.devices.inputs import Inputs
 from thermostand.drivers.devices.relays import Relays
 from thermostand.drivers.devices.thermometers import Thermometers, ThermometerSettings
 from thermostand.drivers.settings import Identity, same_device
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import TcpEngine
 from thermostand.drivers.sim.units.relays import FakeRelays
 from thermostand.drivers.sim.units.thermometers import FakeThermometers
-from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import RegisterMap, load_register_map
 from thermostand.foundation.clock import FollowedClock, WallClock

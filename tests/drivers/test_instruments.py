@@ -10,12 +10,11 @@ import pytest
 
 from thermostand.drivers.devices.probes import Probe, ProbeSettings
 from thermostand.drivers.devices.thermometers import Calibration, Thermometers, ThermometerSettings
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
-from thermostand.drivers.sim.units.adam_4015 import FakeAdam4015
 from thermostand.drivers.sim.units.modbus import TcpEngine
 from thermostand.drivers.sim.units.probes import FakeProbe
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.units.thermometers import FakeAdam4015
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import load_register_map
 from thermostand.foundation.clock import FollowedClock, WallClock

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.link import ByteLink, SerialSettings, open_link
 from thermostand.foundation.addresses import state_as
 from thermostand.foundation.errors import Unreachable

@@ -11,10 +11,9 @@ import yaml
 
 from tests.drivers.other_regulators import DEGC, FakeBinder, FakeEurotherm, FakeEzZone, FakeF4t, float_words
 from thermostand.drivers.devices.regulators.regulator import Regulator
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import TcpEngine
-from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import RegisterMap, load_register_map
 from thermostand.foundation.clock import FollowedClock, WallClock, seconds_ns

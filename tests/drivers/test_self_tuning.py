@@ -8,11 +8,10 @@ from contextlib import asynccontextmanager
 import pytest
 
 from thermostand.drivers.devices.regulators.regulator import Regulator
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import TcpEngine
 from thermostand.drivers.sim.units.regulator import FakeRegulator
-from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import load_register_map
 from thermostand.foundation.clock import FollowedClock, WallClock, seconds_ns

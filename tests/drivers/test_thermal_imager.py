@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.still_plant import StillPlant
 from thermostand.drivers.devices.imager.thermal_imager import SpotSettings, ThermalImager, ThermalImagerSettings
 from thermostand.drivers.sim.units.thermal_imager import FakeThermalImager
 from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
@@ -16,18 +15,6 @@ from thermostand.foundation.readings import Quality, Reading
 
 START_NS = 1_800_000_000 * NS_PER_S
 SPOTS = {"lens": (80, 60), "housing": (40, 30), "back": (120, 90)}
-
-
-class Sight:
-    """What the imager sees, at will."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.on_step: list[Callable[[int, float], None]] = []
-        self.chamber_degC, self.lens_degC, self.body_degC, self.sensor_degC = 30.0, 41.0, 45.0, 55.0
-
-    def advance(self, now_ns: int) -> None:
-        pass
 
 
 class HandClock(VirtualClock):
@@ -40,7 +27,7 @@ class HandClock(VirtualClock):
 class Bench:
     def __init__(self, folder: Path, **settings: object) -> None:
         self.clock = HandClock(START_NS)
-        self.sight = Sight()
+        self.sight = StillPlant(START_NS, chamber=30.0, lens=41.0, body=45.0, sensor=55.0)
         self.fake = FakeThermalImager(self.sight, folder, SPOTS, seed=1)
         spots = {name: SpotSettings(x_px=x, y_px=y) for name, (x, y) in SPOTS.items()}
         known = {"folder": folder, "spots": spots, "stale_after_s": 300.0, **settings}

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from thermostand.drivers.framing.ximc import encode
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.link import ByteLink, SerialSettings, open_link
 from thermostand.drivers.wires.ximc_client import XimcClient
 from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable

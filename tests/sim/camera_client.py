@@ -2,7 +2,6 @@
 
 import socket
 import struct
-import threading
 from functools import cache
 
 import numpy as np
@@ -10,10 +9,11 @@ from numpy.typing import NDArray
 
 from tests.addresses import camera_address
 from tests.sim.gvcp_client import decode_ack, decode_leader, pack_read_memory
+from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige import gvcp, gvsp
 from thermostand.drivers.sim.gige.genicam import features
-from thermostand.drivers.sim.gige.gvcp import Ack, Command, Request, Resend, Status
-from thermostand.drivers.sim.gige.gvsp import Kind, Packet
+from thermostand.drivers.sim.gige.gvcp import Ack, GvcpCommand, GvcpRequest, GvcpStatus, Resend
+from thermostand.drivers.sim.gige.gvsp import Packet, PacketKind
 from thermostand.foundation.clock import seconds_ns
 
 WIDTH, HEIGHT = 320, 240
@@ -29,16 +29,8 @@ def address() -> str:
     return camera_address()
 
 
-class StubPlant:
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.sensor_degC = 41.37
-        self.body_degC = 33.1
-        self.camera_powered = True
-        self.camera_power_on_ns: int | None = START_NS
-
-    def advance(self, now_ns: int) -> None:
-        pass
+def still_plant() -> StillPlant:
+    return StillPlant(START_NS, sensor=41.37, body=33.1)
 
 
 def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT) -> NDArray[np.uint8]:
@@ -62,12 +54,12 @@ class Client:
         """The acknowledge of one command; TimeoutError when there is none."""
         self.req_id += 1
         self.control.settimeout(WAIT_s)
-        self.control.sendto(Request(command, self.req_id, payload).encode(), (address(), gvcp.PORT))
+        self.control.sendto(GvcpRequest(command, self.req_id, payload).encode(), (address(), gvcp.PORT))
         return decode_ack(self.control.recv(1024))
 
     def is_ignored(self) -> bool:
         self.control.settimeout(SILENCE_s)
-        self.control.sendto(Request(Command.DISCOVERY, 0xFFFF).encode(), (address(), gvcp.PORT))
+        self.control.sendto(GvcpRequest(GvcpCommand.DISCOVERY, 0xFFFF).encode(), (address(), gvcp.PORT))
         try:
             self.control.recv(1024)
         except TimeoutError:
@@ -77,22 +69,22 @@ class Client:
     def set(self, name: str, value: float) -> int:
         feature = FEATURES[name]
         data = struct.pack(">d", value) if feature.kind == "float" else int(value).to_bytes(4, "big")
-        return self.ask(Command.WRITEMEM, gvcp.pack_write_memory(feature.address, data)).status
+        return self.ask(GvcpCommand.WRITEMEM, gvcp.pack_write_memory(feature.address, data)).status
 
     def get(self, name: str) -> float:
         feature = FEATURES[name]
         payload = pack_read_memory(feature.address, feature.length)
-        ack = self.ask(Command.READMEM, payload)
-        assert ack.status == Status.OK
+        ack = self.ask(GvcpCommand.READMEM, payload)
+        assert ack.status == GvcpStatus.OK
         data = ack.payload[4:]
         return struct.unpack(">d", data)[0] if feature.kind == "float" else int.from_bytes(data, "big")
 
     def connect(self, packet_size: int = 1500) -> None:
         """Take control and open the stream."""
-        assert self.set("GevCCP", 2) == Status.OK
-        assert self.set("GevSCDA", 0x7F000001) == Status.OK
-        assert self.set("GevSCPHostPort", self.stream.getsockname()[1]) == Status.OK
-        assert self.set("GevSCPSPacketSize", packet_size) == Status.OK
+        assert self.set("GevCCP", 2) == GvcpStatus.OK
+        assert self.set("GevSCDA", 0x7F000001) == GvcpStatus.OK
+        assert self.set("GevSCPHostPort", self.stream.getsockname()[1]) == GvcpStatus.OK
+        assert self.set("GevSCPSPacketSize", packet_size) == GvcpStatus.OK
 
     def arm(self, exposure_us: float = 100_000.0) -> None:
         """Wait for software triggers."""
@@ -111,7 +103,7 @@ class Client:
     def packets(self) -> list[Packet]:
         """All packets up to a trailer."""
         packets = [self.packet()]
-        while packets[-1].kind != Kind.TRAILER:
+        while packets[-1].kind != PacketKind.TRAILER:
             packets.append(self.packet())
         return packets
 
@@ -129,7 +121,7 @@ class Client:
 
 def image_of(packets: list[Packet]) -> NDArray[np.uint8]:
     leader = decode_leader(packets[0].data)
-    pixels = b"".join(packet.data for packet in packets if packet.kind == Kind.PAYLOAD)
+    pixels = b"".join(packet.data for packet in packets if packet.kind == PacketKind.PAYLOAD)
     return np.frombuffer(pixels, np.uint8).reshape(leader.height, leader.width)
 
 

@@ -4,15 +4,16 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.sim.camera_client import HEIGHT, START_NS, WIDTH, Client, StubPlant, address, render
+from tests.sim.camera_client import HEIGHT, START_NS, WIDTH, Client, address, render, still_plant
+from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults
 from thermostand.foundation.clock import FollowedClock
 
 
 @pytest.fixture
-def plant() -> StubPlant:
-    return StubPlant()
+def plant() -> StillPlant:
+    return still_plant()
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ def faults() -> CameraFaults:
 
 
 @pytest.fixture
-def camera(plant: StubPlant, clock: FollowedClock, faults: CameraFaults) -> Iterator[FakeCamera]:
+def camera(plant: StillPlant, clock: FollowedClock, faults: CameraFaults) -> Iterator[FakeCamera]:
     camera = FakeCamera(plant, clock, render, address(), "SN1", size_px=(WIDTH, HEIGHT), faults=faults)
     camera.start()
     yield camera

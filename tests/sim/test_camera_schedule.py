@@ -1,7 +1,7 @@
 import pytest
 
+from thermostand.drivers.sim.gige.camera import Exposure, Schedule
 from thermostand.drivers.sim.gige.camera_registers import Registers
-from thermostand.drivers.sim.gige.camera_schedule import Schedule, Shot
 from thermostand.drivers.sim.gige.genicam import features
 
 MS = 1_000_000
@@ -18,7 +18,7 @@ def registers() -> Registers:
     return registers
 
 
-def taken(schedule: Schedule, now_ns: int) -> Shot | None:
+def taken(schedule: Schedule, now_ns: int) -> Exposure | None:
     return schedule.due(now_ns)[0]
 
 
@@ -36,7 +36,7 @@ def test_a_free_running_frame_is_due_when_its_exposure_has_ended(registers: Regi
     schedule = Schedule(registers, real_time=True)
     schedule.start(1000 * MS)
     assert schedule.due(1099 * MS) == (None, 1100 * MS)
-    assert taken(schedule, 1100 * MS) == Shot(1, 0, 1000 * MS, 100 * MS, 0.0)
+    assert taken(schedule, 1100 * MS) == Exposure(1, 0, 1000 * MS, 100 * MS, 0.0)
     assert schedule.due(1100 * MS) == (None, 1600 * MS)
     shot = taken(schedule, 1600 * MS)
     assert shot is not None
@@ -56,17 +56,17 @@ def test_the_period_is_never_shorter_than_the_exposure(registers: Registers) -> 
     registers.put("ExposureTime", 2_000_000.0)
     schedule = Schedule(registers, real_time=True)
     schedule.start(0)
-    assert taken(schedule, 2000 * MS) == Shot(1, 0, 0, 2000 * MS, 0.0)
+    assert taken(schedule, 2000 * MS) == Exposure(1, 0, 0, 2000 * MS, 0.0)
     assert schedule.due(2000 * MS) == (None, 4000 * MS)
 
 
 def test_a_change_of_rate_goes_on_from_where_it_is(registers: Registers) -> None:
     schedule = Schedule(registers, real_time=True)
     schedule.start(0)
-    assert taken(schedule, 1100 * MS) == Shot(1, 2, 1000 * MS, 100 * MS, 0.0)
+    assert taken(schedule, 1100 * MS) == Exposure(1, 2, 1000 * MS, 100 * MS, 0.0)
     registers.put("AcquisitionFrameRate", 1.0)
     schedule.reschedule(1200 * MS)
-    assert taken(schedule, 1300 * MS) == Shot(1, 3, 1200 * MS, 100 * MS, 0.0)
+    assert taken(schedule, 1300 * MS) == Exposure(1, 3, 1200 * MS, 100 * MS, 0.0)
     assert schedule.due(1300 * MS) == (None, 2300 * MS)
 
 
@@ -78,7 +78,7 @@ def test_a_trigger_exposes_from_now_and_is_due_at_its_end_in_real_time(registers
     assert taken(schedule, 900 * MS) is None
     schedule.trigger(1000 * MS)
     assert schedule.due(1000 * MS) == (None, 1100 * MS)
-    assert taken(schedule, 1100 * MS) == Shot(1, 0, 1000 * MS, 100 * MS, 6.0)
+    assert taken(schedule, 1100 * MS) == Exposure(1, 0, 1000 * MS, 100 * MS, 6.0)
     assert taken(schedule, 1200 * MS) is None
 
 
@@ -88,7 +88,7 @@ def test_a_trigger_is_due_at_once_in_virtual_time(registers: Registers) -> None:
     schedule.start(0)
     for index in range(2):
         schedule.trigger(1000 * MS)
-        assert taken(schedule, 1000 * MS) == Shot(1, index, 1000 * MS, 100 * MS, 0.0)
+        assert taken(schedule, 1000 * MS) == Exposure(1, index, 1000 * MS, 100 * MS, 0.0)
 
 
 @pytest.mark.parametrize(("mode", "source"), [(0, SOFTWARE), (1, LINE0)])

@@ -11,10 +11,8 @@ import pytest
 
 from tests.addresses import camera_address
 from thermostand.drivers.sim.control import Control
-from thermostand.drivers.sim.fault_schedule import FaultSchedule, PlannedFault, parse_fault
-from thermostand.drivers.sim.laboratory import Laboratory
-from thermostand.drivers.sim.laboratory_faults import FAULTS, inject
-from thermostand.drivers.sim.laboratory_spec import LaboratorySpec
+from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
+from thermostand.drivers.sim.laboratory_faults import FAULTS, FaultSchedule, PlannedFault, inject, parse_fault
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.stand_config import load_config, packaged

@@ -129,7 +129,7 @@ def test_the_region_must_fit_the_sensor(registers: Registers) -> None:
     for name, value in (("OffsetX", 36), ("Width", 36), ("OffsetX", 2), ("Width", 12)):
         with pytest.raises(gvcp.Nack) as refused:
             write(registers, name, value)
-        assert refused.value.status == gvcp.Status.BAD_PARAMETER
+        assert refused.value.status == gvcp.GvcpStatus.BAD_PARAMETER
     assert (registers.integer("OffsetX"), registers.integer("Width")) == (32, 32)
 
 
@@ -137,7 +137,7 @@ def test_the_region_must_fit_the_sensor(registers: Registers) -> None:
 def test_an_exposure_out_of_range_is_refused(registers: Registers, value: float) -> None:
     with pytest.raises(gvcp.Nack) as refused:
         registers.write(BY_NAME["ExposureTime"].address, struct.pack(">d", value))
-    assert refused.value.status == gvcp.Status.BAD_PARAMETER
+    assert refused.value.status == gvcp.GvcpStatus.BAD_PARAMETER
     assert registers.real("ExposureTime") == 10_000.0
 
 
@@ -146,23 +146,23 @@ def test_what_shapes_the_stream_is_locked_while_streaming(registers: Registers, 
     registers.put("TLParamsLocked", 1)
     with pytest.raises(gvcp.Nack) as refused:
         write(registers, name, 0x01100005 if name == "PixelFormat" else 512)
-    assert refused.value.status == gvcp.Status.ACCESS_DENIED
+    assert refused.value.status == gvcp.GvcpStatus.ACCESS_DENIED
 
 
 @pytest.mark.parametrize(
     ("address", "data", "status"),
     [
-        (0x10300, bytes(4), gvcp.Status.WRITE_PROTECT),  # PayloadSize
-        (0x40000, bytes(4), gvcp.Status.WRITE_PROTECT),  # the XML
-        (0x0934, bytes(4), gvcp.Status.WRITE_PROTECT),  # the capability register
-        (0x90000, bytes(4), gvcp.Status.BAD_ADDRESS),
-        (0x10238, bytes(4), gvcp.Status.BAD_ADDRESS),  # half an ExposureTime
-        (0x00E8, bytes(20), gvcp.Status.BAD_PARAMETER),  # a user ID that is too long
-        (0x10120, b"\1\2\3\4", gvcp.Status.BAD_PARAMETER),  # no pixel format
+        (0x10300, bytes(4), gvcp.GvcpStatus.WRITE_PROTECT),  # PayloadSize
+        (0x40000, bytes(4), gvcp.GvcpStatus.WRITE_PROTECT),  # the XML
+        (0x0934, bytes(4), gvcp.GvcpStatus.WRITE_PROTECT),  # the capability register
+        (0x90000, bytes(4), gvcp.GvcpStatus.BAD_ADDRESS),
+        (0x10238, bytes(4), gvcp.GvcpStatus.BAD_ADDRESS),  # half an ExposureTime
+        (0x00E8, bytes(20), gvcp.GvcpStatus.BAD_PARAMETER),  # a user ID that is too long
+        (0x10120, b"\1\2\3\4", gvcp.GvcpStatus.BAD_PARAMETER),  # no pixel format
     ],
 )
 def test_a_write_that_makes_no_sense_is_refused(
-    registers: Registers, address: int, data: bytes, status: gvcp.Status
+    registers: Registers, address: int, data: bytes, status: gvcp.GvcpStatus
 ) -> None:
     with pytest.raises(gvcp.Nack) as refused:
         registers.write(address, data)
@@ -178,4 +178,4 @@ def test_a_read_beyond_the_memory_is_refused(registers: Registers) -> None:
     for address, count in ((0x0FFC, 8), (0x20000, 4)):
         with pytest.raises(gvcp.Nack) as refused:
             registers.read(address, count)
-        assert refused.value.status == gvcp.Status.BAD_ADDRESS
+        assert refused.value.status == gvcp.GvcpStatus.BAD_ADDRESS

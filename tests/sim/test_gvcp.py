@@ -4,17 +4,17 @@ from hypothesis import strategies as st
 
 from tests.sim.gvcp_client import decode_ack, pack_read_memory, pack_words
 from thermostand.drivers.sim.gige import gvcp
-from thermostand.drivers.sim.gige.gvcp import Ack, Command, Malformed, Nack, Request, Resend, Status
+from thermostand.drivers.sim.gige.gvcp import Ack, GvcpCommand, GvcpRequest, GvcpStatus, Malformed, Nack, Resend
 
 # One line per datagram: the bytes, and what they mean. The same table serves encoder and decoder.
 REQUESTS = [
-    ("42 01 0002 0000 ffff", Request(Command.DISCOVERY, 0xFFFF)),
-    ("42 01 0080 0004 0001 00000a00", Request(Command.READREG, 1, pack_words([0x0A00]))),
-    ("42 01 0082 0008 0002 00000a00 00000002", Request(Command.WRITEREG, 2, pack_words([0x0A00, 2]))),
-    ("42 01 0084 0008 0003 00000200 0000 0200", Request(Command.READMEM, 3, pack_read_memory(0x200, 512))),
+    ("42 01 0002 0000 ffff", GvcpRequest(GvcpCommand.DISCOVERY, 0xFFFF)),
+    ("42 01 0080 0004 0001 00000a00", GvcpRequest(GvcpCommand.READREG, 1, pack_words([0x0A00]))),
+    ("42 01 0082 0008 0002 00000a00 00000002", GvcpRequest(GvcpCommand.WRITEREG, 2, pack_words([0x0A00, 2]))),
+    ("42 01 0084 0008 0003 00000200 0000 0200", GvcpRequest(GvcpCommand.READMEM, 3, pack_read_memory(0x200, 512))),
     (
         "42 01 0086 000c 0004 00010238 40d3880000000000",
-        Request(Command.WRITEMEM, 4, gvcp.pack_write_memory(0x10238, bytes.fromhex("40d3880000000000"))),
+        GvcpRequest(GvcpCommand.WRITEMEM, 4, gvcp.pack_write_memory(0x10238, bytes.fromhex("40d3880000000000"))),
     ),
     ("42 00 0040 000c 0005 0000 0007 00000003 00000009", Resend(7, 3, 9).request(5)),
     (
@@ -23,14 +23,14 @@ REQUESTS = [
     ),
 ]
 ACKS = [
-    ("0000 0081 0004 0001 00000002", Ack(Command.READREG, 1, pack_words([2]))),
-    ("0000 0083 0004 0002 0000 0001", Ack(Command.WRITEREG, 2, gvcp.pack_written(1))),
-    ("8006 0083 0000 0003", Ack(Command.WRITEREG, 3, status=Status.ACCESS_DENIED)),
+    ("0000 0081 0004 0001 00000002", Ack(GvcpCommand.READREG, 1, pack_words([2]))),
+    ("0000 0083 0004 0002 0000 0001", Ack(GvcpCommand.WRITEREG, 2, gvcp.pack_written(1))),
+    ("8006 0083 0000 0003", Ack(GvcpCommand.WRITEREG, 3, status=GvcpStatus.ACCESS_DENIED)),
 ]
 
 
 @pytest.mark.parametrize(("wire", "request_"), REQUESTS)
-def test_a_command_is_these_bytes_and_back_even_with_bytes_behind_it(wire: str, request_: Request) -> None:
+def test_a_command_is_these_bytes_and_back_even_with_bytes_behind_it(wire: str, request_: GvcpRequest) -> None:
     datagram = bytes.fromhex(wire)
     assert request_.encode() == datagram
     assert gvcp.decode_request(datagram) == request_
@@ -56,7 +56,7 @@ def test_a_command_cut_short_anywhere_is_malformed(wire: str) -> None:
 def test_a_command_whose_acknowledge_has_no_code_is_malformed() -> None:
     """An acknowledge is its command plus 1, in 16 bits."""
     with pytest.raises(Malformed, match="no acknowledge can answer"):
-        gvcp.decode_request(Request(0xFFFF, 1).encode())
+        gvcp.decode_request(GvcpRequest(0xFFFF, 1).encode())
 
 
 @pytest.mark.parametrize("wire", [wire for wire, _ in ACKS])
@@ -75,13 +75,13 @@ def test_a_wrong_key_is_malformed() -> None:
 @pytest.mark.parametrize(
     ("address", "count", "status"),
     [
-        (0, 0, Status.BAD_PARAMETER),
-        (0, 516, Status.BAD_PARAMETER),
-        (2, 4, Status.BAD_ALIGNMENT),
-        (0, 3, Status.BAD_ALIGNMENT),
+        (0, 0, GvcpStatus.BAD_PARAMETER),
+        (0, 516, GvcpStatus.BAD_PARAMETER),
+        (2, 4, GvcpStatus.BAD_ALIGNMENT),
+        (0, 3, GvcpStatus.BAD_ALIGNMENT),
     ],
 )
-def test_readmem_takes_1_to_128_whole_words(address: int, count: int, status: Status) -> None:
+def test_readmem_takes_1_to_128_whole_words(address: int, count: int, status: GvcpStatus) -> None:
     with pytest.raises(Nack) as refused:
         gvcp.unpack_read_memory(pack_read_memory(address, count))
     assert refused.value.status == status
@@ -97,7 +97,7 @@ def test_payloads_of_no_whole_words_are_refused(payload: bytes) -> None:
 def test_a_short_packet_resend_is_refused() -> None:
     whole = Resend(1, 2, 3, extended=True).request(1)
     with pytest.raises(Nack):
-        gvcp.unpack_resend(Request(whole.command, 1, whole.payload[:-1], whole.flags))
+        gvcp.unpack_resend(GvcpRequest(whole.command, 1, whole.payload[:-1], whole.flags))
 
 
 u16 = st.integers(0, 0xFFFF)
@@ -108,7 +108,7 @@ payloads = st.binary(max_size=540)
 
 @given(st.integers(0, 0xFFFE), u16, payloads, st.integers(0, 255))
 def test_any_command_survives_the_round_trip(command: int, req_id: int, payload: bytes, flags: int) -> None:
-    request = Request(command, req_id, payload, flags)
+    request = GvcpRequest(command, req_id, payload, flags)
     assert gvcp.decode_request(request.encode()) == request
 
 

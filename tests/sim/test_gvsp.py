@@ -4,15 +4,15 @@ from hypothesis import strategies as st
 
 from tests.sim.gvcp_client import decode_leader
 from thermostand.drivers.sim.gige import gvsp
-from thermostand.drivers.sim.gige.gvsp import Block, Kind, Leader, Malformed, Packet, PixelFormat
+from thermostand.drivers.sim.gige.gvsp import ImageBlock, Leader, Malformed, Packet, PacketKind, PixelFormat
 
 PACKETS = [
-    ("0000 0001 01000000", Packet(Kind.LEADER, 1, 0)),
-    ("0000 ffff 03000005 aabb", Packet(Kind.PAYLOAD, 0xFFFF, 5, b"\xaa\xbb")),
-    ("0100 0002 02000009", Packet(Kind.TRAILER, 2, 9, status=gvsp.RESENT)),
+    ("0000 0001 01000000", Packet(PacketKind.LEADER, 1, 0)),
+    ("0000 ffff 03000005 aabb", Packet(PacketKind.PAYLOAD, 0xFFFF, 5, b"\xaa\xbb")),
+    ("0100 0002 02000009", Packet(PacketKind.TRAILER, 2, 9, status=gvsp.RESENT)),
     (
         "0000 0000 83000000 0000000100000002 01020304 cc",
-        Packet(Kind.PAYLOAD, (1 << 32) + 2, 0x01020304, b"\xcc", extended=True),
+        Packet(PacketKind.PAYLOAD, (1 << 32) + 2, 0x01020304, b"\xcc", extended=True),
     ),
 ]
 LEADER = Leader(0x0102030405060708, PixelFormat.MONO8, 64, 48, 4, 2)
@@ -56,8 +56,8 @@ def test_a_leader_of_something_else_than_an_image_is_malformed() -> None:
         decode_leader(b"\0\0\0\4" + LEADER_BYTES[4:])
 
 
-def block_of(pixels: bytes, packet_size: int, extended: bool) -> Block:
-    return Block(7, LEADER, memoryview(pixels), packet_size, extended)
+def block_of(pixels: bytes, packet_size: int, extended: bool) -> ImageBlock:
+    return ImageBlock(7, LEADER, memoryview(pixels), packet_size, extended)
 
 
 def test_a_full_frame_at_8000_bytes_takes_630_payload_packets() -> None:
@@ -85,10 +85,10 @@ def test_any_block_is_whole_again_after_the_wire(pixels: bytes, packet_size: int
     block = block_of(pixels, packet_size, extended)
     packets = [gvsp.decode(b"".join(block.packet(packet_id))) for packet_id in range(block.trailer_id + 1)]
     leader, *payload, trailer = packets
-    assert (leader.kind, trailer.kind) == (Kind.LEADER, Kind.TRAILER)
+    assert (leader.kind, trailer.kind) == (PacketKind.LEADER, PacketKind.TRAILER)
     assert decode_leader(leader.data) == LEADER
     assert [packet.packet_id for packet in payload] == list(range(1, len(payload) + 1))
-    assert {packet.kind for packet in payload} == {Kind.PAYLOAD}
+    assert {packet.kind for packet in payload} == {PacketKind.PAYLOAD}
     assert {len(packet.data) for packet in payload[:-1]} <= {block.data_size}
     assert b"".join(packet.data for packet in payload) == pixels
 
@@ -96,7 +96,7 @@ def test_any_block_is_whole_again_after_the_wire(pixels: bytes, packet_size: int
 @given(
     st.builds(
         Packet,
-        st.sampled_from(Kind),
+        st.sampled_from(PacketKind),
         st.integers(0, 0xFFFF),
         st.integers(0, 0xFFFFFF),
         st.binary(max_size=50),

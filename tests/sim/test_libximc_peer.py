@@ -16,20 +16,18 @@ from typing import Any
 import pytest
 
 LABORATORY = """
-import sys, threading
+import sys
 from pathlib import Path
 from thermostand.foundation.clock import WallClock
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 
-class Laboratory:
-    lock = threading.RLock()
-    def advance(self, now_ns): pass
-
-linear = FakeAxis(Laboratory(), WallClock(), LINEAR_8MT160_300, 0x1234, "linear", start_steps=200)
-rotary = FakeAxis(Laboratory(), WallClock(), ROTARY_8MR151, 0x5678, "rotary", start_steps=1300)
+clock = WallClock()
+plant = Plant(PlantSpec(), clock.now_ns())
+linear = FakeAxis(plant, clock, LINEAR_8MT160_300, 0x1234, "linear", start_steps=200)
+rotary = FakeAxis(plant, clock, ROTARY_8MR151, 0x5678, "rotary", start_steps=1300)
 pty = PtyWire(Path(sys.argv[1]), linear.engine(), LinkFaults())
 tcp = TcpWire("127.0.0.1", 0, rotary.engine, LinkFaults())
 print(tcp.port, flush=True)

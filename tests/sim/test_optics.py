@@ -14,7 +14,7 @@ from thermostand.drivers.sim.physics.optics import (
     FOCAL_px,
     Nodes,
     Optics,
-    Placement,
+    StandPlacement,
     marker_centres_mm,
     optics_at,
     project,
@@ -49,7 +49,7 @@ def test_a_pixel_is_114_micrometres_of_the_target():
 
 
 def test_marker_1_is_bottom_left_and_numbers_run_along_the_long_side():
-    centres = true_centres_px(optics_at("modified", COLD, Placement()))
+    centres = true_centres_px(optics_at("modified", COLD, StandPlacement()))
     assert centres.shape == (54, 2)
     assert centres[0, 0] < centres[8, 0]
     assert centres[0, 1] > centres[45, 1]
@@ -65,7 +65,9 @@ def test_moving_the_target_away_shrinks_it_about_the_principal_point():
 
 
 def test_a_positive_rotary_angle_turns_the_right_edge_away():
-    turned = optics_at("modified", COLD, Placement(rotary_deg=20.0, target_offset_mm=(0.0, 0.0), target_roll_deg=0.0))
+    turned = optics_at(
+        "modified", COLD, StandPlacement(rotary_deg=20.0, target_offset_mm=(0.0, 0.0), target_roll_deg=0.0)
+    )
     point = project(replace(turned, k1=0.0), np.array([[100.0, 0.0]]))[0]
     depth_mm = 826.0 + 100.0 * math.sin(math.radians(20.0))
     assert point[0] - turned.cx_px == pytest.approx(FOCAL_px * 100.0 * math.cos(math.radians(20.0)) / depth_mm)
@@ -118,8 +120,8 @@ def test_solids_expand_by_their_coefficient_and_a_little_faster_when_warm():
 
 
 def test_the_glass_target_grows_with_its_own_temperature():
-    warm = true_centres_px(optics_at("modified", replace(COLD, artifact_degC=34.0), Placement()))
-    cold = true_centres_px(optics_at("modified", COLD, Placement()))
+    warm = true_centres_px(optics_at("modified", replace(COLD, artifact_degC=34.0), StandPlacement()))
+    cold = true_centres_px(optics_at("modified", COLD, StandPlacement()))
     width_change = np.ptp(warm[:9, 0]) / np.ptp(cold[:9, 0]) - 1.0
     assert width_change == pytest.approx(9.0e-5, rel=0.03)
 

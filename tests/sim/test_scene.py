@@ -9,25 +9,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from thermostand.drivers.sim.physics.optics import Nodes, Optics, Placement, optics_at
+from thermostand.drivers.sim.physics.optics import Nodes, Optics, StandPlacement, optics_at, true_centres_px
 from thermostand.drivers.sim.physics.scene import (
-    Scene,
     SceneSpec,
+    SimulatedScene,
     disc_coverages,
     polygon_coverage,
     still,
-    true_centres_px,
 )
 
 TIME_ns = 1_700_000_000_000_000_000
 FLAT = SceneSpec(light_slope=(0.0, 0.0), vignetting=0.0)
 ROWS = 700  # with markers in them
-SCENE = Scene(FLAT, seed=1)
+SCENE = SimulatedScene(FLAT, seed=1)
 COLD = Nodes(24.0, 24.0, 24.0, 24.0, 24.0, 24.0)
 
 
 def at(linear_mm: float = 0.0, rotary_deg: float = 0.0, roll_deg: float = 0.0) -> Optics:
-    return optics_at("modified", COLD, Placement(linear_mm, rotary_deg, camera_roll_deg=roll_deg))
+    return optics_at("modified", COLD, StandPlacement(linear_mm, rotary_deg, camera_roll_deg=roll_deg))
 
 
 def centroid(weights: NDArray[np.floating]) -> tuple[float, float]:
@@ -87,7 +86,7 @@ def test_signal_follows_exposure_and_gain_but_the_black_level_does_not():
 
 
 def test_light_is_uneven_and_smooth():
-    image = Scene(SceneSpec(), seed=1).noise_free(at(), 0.1, 0.0, 1.0)
+    image = SimulatedScene(SceneSpec(), seed=1).noise_free(at(), 0.1, 0.0, 1.0)
     assert image[1023, 1223] == pytest.approx(200.0, abs=0.1)
     assert image[1023, 2447] > image[1023, 0] + 10.0
     assert image[0, 0] < 190.0
@@ -95,7 +94,7 @@ def test_light_is_uneven_and_smooth():
 
 
 def test_noise_has_the_variance_of_shot_and_read_noise_and_no_mean():
-    scene = Scene(FLAT, seed=4)
+    scene = SimulatedScene(FLAT, seed=4)
     first = scene.render(at(), TIME_ns, 0.1, 0.0, 1.0, 200).astype(float)
     second = scene.render(at(), TIME_ns + 1, 0.1, 0.0, 1.0, 200).astype(float)
     variance = 1.0 + 197.0 / 40.0 + 1.0 / 12.0
@@ -105,7 +104,7 @@ def test_noise_has_the_variance_of_shot_and_read_noise_and_no_mean():
 
 
 def test_noise_is_white():
-    noise = Scene(FLAT, seed=4).render(at(), TIME_ns, 0.1, 0.0, 1.0, 256).astype(float) - 200.0
+    noise = SimulatedScene(FLAT, seed=4).render(at(), TIME_ns, 0.1, 0.0, 1.0, 256).astype(float) - 200.0
     variance = noise.var()
     for shifted, kept in ((noise[1:], noise[:-1]), (noise[:, 1:], noise[:, :-1]), (noise[64:], noise[:-64])):
         assert abs(np.mean(shifted * kept)) / variance < 0.006  # 4 sigma of 600 000 pixels
@@ -114,24 +113,24 @@ def test_noise_is_white():
 
 
 def test_a_frame_depends_on_seed_and_time_only():
-    scene = Scene(SceneSpec(), seed=7)
+    scene = SimulatedScene(SceneSpec(), seed=7)
     frame = scene.render(at(), TIME_ns, 0.1, 0.0, 1.0, ROWS)
     other = scene.render(at(), TIME_ns + 500_000_000, 0.1, 0.0, 1.0, ROWS)
     assert (frame != other).mean() > 0.5
-    assert (Scene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 1.0, ROWS) == frame).all()
+    assert (SimulatedScene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 1.0, ROWS) == frame).all()
     assert (scene.render(at(), TIME_ns, 0.1, 0.0, 1.0, ROWS) == frame).all()
-    assert (Scene(SceneSpec(), seed=8).render(at(), TIME_ns, 0.1, 0.0, 1.0, ROWS) != frame).mean() > 0.5
+    assert (SimulatedScene(SceneSpec(), seed=8).render(at(), TIME_ns, 0.1, 0.0, 1.0, ROWS) != frame).mean() > 0.5
 
 
 @pytest.fixture(scope="module")
 def whole() -> NDArray[np.uint8]:
     """A whole frame; not to be changed."""
-    return Scene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 0.9)
+    return SimulatedScene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 0.9)
 
 
 @pytest.mark.parametrize("rows", [2, 700, 2047])
 def test_the_upper_rows_alone_are_those_of_the_whole_frame(rows: int, whole: NDArray[np.uint8]):
-    assert (Scene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 0.9, rows) == whole[:rows]).all()
+    assert (SimulatedScene(SceneSpec(), seed=7).render(at(), TIME_ns, 0.1, 0.0, 0.9, rows) == whole[:rows]).all()
 
 
 def test_an_overexposed_frame_clips_at_255():
@@ -142,7 +141,7 @@ def test_an_overexposed_frame_clips_at_255():
 
 
 def test_a_shut_flap_gives_a_dark_frame():
-    frame = Scene(SceneSpec(), seed=1).render(at(), TIME_ns, 0.1, 0.0, 0.0)
+    frame = SimulatedScene(SceneSpec(), seed=1).render(at(), TIME_ns, 0.1, 0.0, 0.0)
     assert frame.dtype == np.uint8
     assert frame.mean() == pytest.approx(3.0, abs=0.05)
     assert frame.max() < 12
@@ -166,7 +165,7 @@ def test_markers_cut_by_the_border_are_drawn_as_far_as_they_reach():
 
 
 def test_a_target_out_of_sight_leaves_the_paper_white():
-    optics = optics_at("modified", COLD, Placement(target_offset_mm=(2000.0, 0.0)))
+    optics = optics_at("modified", COLD, StandPlacement(target_offset_mm=(2000.0, 0.0)))
     assert SCENE.noise_free(optics, 0.1, 0.0, 1.0).min() == pytest.approx(200.0, abs=1e-3)
 
 

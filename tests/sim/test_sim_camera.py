@@ -12,14 +12,14 @@ from tests.sim.camera_client import (
     START_NS,
     WIDTH,
     Client,
-    StubPlant,
     WAIT_s,
     address,
 )
 from tests.sim.gvcp_client import decode_ack, pack_read_memory
+from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.camera import FakeCamera
-from thermostand.drivers.sim.gige.gvcp import Command, Request, Status
+from thermostand.drivers.sim.gige.gvcp import GvcpCommand, GvcpRequest, GvcpStatus
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
@@ -27,10 +27,10 @@ from thermostand.foundation.clock import FollowedClock, seconds_ns
 def test_a_stop_ends_the_frames_and_unlocks_the_settings(client: Client, camera: FakeCamera) -> None:
     client.connect()
     client.arm()
-    assert client.set("Width", 64) == Status.ACCESS_DENIED
+    assert client.set("Width", 64) == GvcpStatus.ACCESS_DENIED
     client.set("AcquisitionStop", 1)
     assert not camera.streaming
-    assert client.set("Width", 64) == Status.OK
+    assert client.set("Width", 64) == GvcpStatus.OK
     client.set("TriggerSoftware", 1)
     assert client.stream_is_silent()
 
@@ -53,7 +53,7 @@ def test_giving_up_control_stops_the_stream(client: Client, camera: FakeCamera) 
 
 
 def test_without_power_the_camera_is_dead_and_comes_back_with_its_defaults(
-    client: Client, camera: FakeCamera, plant: StubPlant, clock: FollowedClock
+    client: Client, camera: FakeCamera, plant: StillPlant, clock: FollowedClock
 ) -> None:
     client.connect()
     client.arm()
@@ -68,14 +68,14 @@ def test_without_power_the_camera_is_dead_and_comes_back_with_its_defaults(
     clock.follow(START_NS + seconds_ns(13.0))
     assert client.get("GevCCP") == 0
     assert client.get("ExposureTime") == 10_000.0
-    assert client.set("Gain", 1.0) == Status.ACCESS_DENIED
+    assert client.set("Gain", 1.0) == GvcpStatus.ACCESS_DENIED
     client.connect()
     client.set("GevTimestampControlLatch", 2)
     assert client.get("GevTimestampValue") == seconds_ns(3.0)
 
 
 def test_a_dip_of_the_supply_that_nobody_saw_costs_everything_too(
-    client: Client, plant: StubPlant, clock: FollowedClock
+    client: Client, plant: StillPlant, clock: FollowedClock
 ) -> None:
     client.connect()
     plant.camera_power_on_ns = START_NS + 1
@@ -88,14 +88,14 @@ def test_a_reset_is_acknowledged_and_followed_by_a_boot(
     client: Client, clock: FollowedClock, camera: FakeCamera
 ) -> None:
     client.connect()
-    assert client.set("DeviceReset", 1) == Status.OK
+    assert client.set("DeviceReset", 1) == GvcpStatus.OK
     assert client.is_ignored()
     clock.follow(START_NS + seconds_ns(3.0))
     assert client.get("GevCCP") == 0
 
 
 def test_the_temperature_is_that_of_the_selected_place_in_quarters_of_a_kelvin(
-    client: Client, plant: StubPlant
+    client: Client, plant: StillPlant
 ) -> None:
     assert client.get("DeviceTemperature") == 41.25
     client.connect()
@@ -105,7 +105,7 @@ def test_the_temperature_is_that_of_the_selected_place_in_quarters_of_a_kelvin(
     assert client.get("DeviceTemperature") == -12.5
 
 
-def test_the_temperature_can_be_zero_stuck_or_refused(client: Client, plant: StubPlant, faults: CameraFaults) -> None:
+def test_the_temperature_can_be_zero_stuck_or_refused(client: Client, plant: StillPlant, faults: CameraFaults) -> None:
     assert client.get("DeviceTemperature") == 41.25
     plant.sensor_degC = 50.0
     faults.temperature = "stuck"
@@ -114,7 +114,7 @@ def test_the_temperature_can_be_zero_stuck_or_refused(client: Client, plant: Stu
     assert client.get("DeviceTemperature") == 0.0
     faults.temperature = "access"
     payload = pack_read_memory(FEATURES["DeviceTemperature"].address, 8)
-    assert client.ask(Command.READMEM, payload).status == Status.ACCESS_DENIED
+    assert client.ask(GvcpCommand.READMEM, payload).status == GvcpStatus.ACCESS_DENIED
     assert client.get("ExposureTime") == 10_000.0
     faults.temperature = None
     assert client.get("DeviceTemperature") == 50.0
@@ -208,9 +208,9 @@ def test_arv_tool_learns_why_a_value_is_refused(arv_tool: str) -> None:
 
 def test_datagrams_of_any_command_leave_the_camera_answering(client: Client) -> None:
     for command in (0x0000, 0x0001, 0x7FFF, 0xFFFE, 0xFFFF):
-        client.control.sendto(Request(command, 7).encode(), (address(), gvcp.PORT))
+        client.control.sendto(GvcpRequest(command, 7).encode(), (address(), gvcp.PORT))
     client.control.settimeout(WAIT_s)
     client.req_id = 100
     while (ack := decode_ack(client.control.recv(1024))).command != 0xFFFE:
-        assert ack.status != Status.OK
-    assert client.ask(Command.DISCOVERY, b"").status == Status.OK
+        assert ack.status != GvcpStatus.OK
+    assert client.ask(GvcpCommand.DISCOVERY, b"").status == GvcpStatus.OK

@@ -13,7 +13,6 @@ from tests.sim.camera_client import (
     WIDTH,
     Client,
     SILENCE_s,
-    StubPlant,
     WAIT_s,
     address,
     expected,
@@ -21,10 +20,11 @@ from tests.sim.camera_client import (
     render,
 )
 from tests.sim.gvcp_client import decode_leader, pack_words
+from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige import gvsp
 from thermostand.drivers.sim.gige.camera import FakeCamera
-from thermostand.drivers.sim.gige.gvcp import Command, Resend, Status
-from thermostand.drivers.sim.gige.gvsp import Kind, Packet
+from thermostand.drivers.sim.gige.gvcp import GvcpCommand, GvcpStatus, Resend
+from thermostand.drivers.sim.gige.gvsp import Packet, PacketKind
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamSender
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
@@ -79,7 +79,7 @@ def test_a_free_run_in_virtual_time_sends_only_the_latest_frame(
 def test_a_region_is_cut_from_the_sensor(client: Client) -> None:
     client.connect()
     for name, value in (("Width", 64), ("Height", 32), ("OffsetX", 8), ("OffsetY", 4)):
-        assert client.set(name, value) == Status.OK
+        assert client.set(name, value) == GvcpStatus.OK
     assert client.get("PayloadSize") == 64 * 32
     client.arm()
     client.set("TriggerSoftware", 1)
@@ -95,11 +95,11 @@ def test_mono12_carries_the_grey_value_in_the_upper_8_of_12_bits(client: Client)
     assert client.get("PayloadSize") == 2 * WIDTH * HEIGHT
     client.arm()
     client.set("TriggerSoftware", 1)
-    pixels = b"".join(packet.data for packet in client.packets() if packet.kind == Kind.PAYLOAD)
+    pixels = b"".join(packet.data for packet in client.packets() if packet.kind == PacketKind.PAYLOAD)
     np.testing.assert_array_equal(np.frombuffer(pixels, "<u2"), expected(0.0).ravel().astype("<u2") * 16)
 
 
-def test_extended_ids_carry_the_same_image(plant: StubPlant, clock: FollowedClock) -> None:
+def test_extended_ids_carry_the_same_image(plant: StillPlant, clock: FollowedClock) -> None:
     camera = FakeCamera(plant, clock, render, address(), "SN1", size_px=(WIDTH, HEIGHT), extended_ids=True)
     camera.start()
     client = Client()
@@ -124,7 +124,7 @@ def test_a_frame_with_a_third_of_its_packets_lost_is_completed_by_resends(
     client.connect(576)
     client.arm()
     client.set("TriggerSoftware", 1)
-    whole = gvsp.Block(1, gvsp.Leader(0, 0, WIDTH, HEIGHT), memoryview(bytes(WIDTH * HEIGHT)), 576)
+    whole = gvsp.ImageBlock(1, gvsp.Leader(0, 0, WIDTH, HEIGHT), memoryview(bytes(WIDTH * HEIGHT)), 576)
     got: dict[int, Packet] = {}
     while len(got) <= whole.trailer_id:
         try:
@@ -139,9 +139,11 @@ def test_a_frame_with_a_third_of_its_packets_lost_is_completed_by_resends(
     assert gvsp.RESENT in {packet.status for packet in got.values()}
 
 
-@pytest.mark.parametrize(("fault", "missing"), [("drop_leader", Kind.LEADER), ("drop_trailer", Kind.TRAILER)])
+@pytest.mark.parametrize(
+    ("fault", "missing"), [("drop_leader", PacketKind.LEADER), ("drop_trailer", PacketKind.TRAILER)]
+)
 def test_a_dropped_leader_or_trailer_comes_when_asked_for(
-    client: Client, faults: CameraFaults, fault: str, missing: Kind
+    client: Client, faults: CameraFaults, fault: str, missing: PacketKind
 ) -> None:
     setattr(faults, fault, True)
     client.connect(8000)
@@ -198,9 +200,9 @@ def test_only_the_last_four_frames_can_be_asked_for_again(client: Client, camera
 
 def test_a_camera_without_resend_says_so_and_ignores_requests(client: Client, faults: CameraFaults) -> None:
     capability = pack_words([0x0934])
-    assert client.ask(Command.READREG, capability).payload[-1] & 0b100
+    assert client.ask(GvcpCommand.READREG, capability).payload[-1] & 0b100
     faults.no_resend = True
-    assert not client.ask(Command.READREG, capability).payload[-1] & 0b100
+    assert not client.ask(GvcpCommand.READREG, capability).payload[-1] & 0b100
     client.connect(8000)
     client.arm()
     client.set("TriggerSoftware", 1)
@@ -211,12 +213,12 @@ def test_a_camera_without_resend_says_so_and_ignores_requests(client: Client, fa
 
 def test_the_test_packet_has_exactly_the_packet_size(client: Client) -> None:
     client.connect(8000)
-    client.ask(Command.WRITEREG, pack_words([0x0D04, 1 << 31 | 8000]))
+    client.ask(GvcpCommand.WRITEREG, pack_words([0x0D04, 1 << 31 | 8000]))
     client.stream.settimeout(WAIT_s)
     assert len(client.stream.recv(65536)) == 8000 - 28
 
 
-def test_packets_leave_at_the_pace(plant: StubPlant, clock: FollowedClock) -> None:
+def test_packets_leave_at_the_pace(plant: StillPlant, clock: FollowedClock) -> None:
     camera = FakeCamera(plant, clock, render, address(), "SN1", size_px=(WIDTH, HEIGHT), pace_MBps=0.4)
     camera.start()
     client = Client()

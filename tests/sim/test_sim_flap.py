@@ -1,12 +1,10 @@
 """The fake Jrk G2: what it answers to control transfers, and where the flap is."""
 
 import struct
-import threading
-from collections.abc import Callable
-from typing import cast
 
 import pytest
 
+from tests.still_plant import StillPlant
 from thermostand.drivers.sim.motion.flap import (
     ERROR_AWAITING_COMMAND,
     ERROR_FEEDBACK_DISCONNECT,
@@ -14,32 +12,19 @@ from thermostand.drivers.sim.motion.flap import (
     ERROR_SOFT_OVER_CURRENT,
     FakeFlap,
 )
-from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.usb import Stall, TimedOut
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000
 
 
-class Laboratory:
-    """The part of the plant a flap uses."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.advanced_ns = 0
-        self.flap_open_at: Callable[[int], float] = lambda _: -1.0
-
-    def advance(self, now_ns: int) -> None:
-        self.advanced_ns = now_ns
-
-
 class Bench:
     """A flap with a clock in hand."""
 
     def __init__(self) -> None:
-        self.plant = Laboratory()
+        self.plant = StillPlant(T0)
         self.clock = FollowedClock(T0)
-        self.flap = FakeFlap(cast(Plant, self.plant), self.clock, "00123")
+        self.flap = FakeFlap(self.plant, self.clock, "00123")
 
     def wait(self, duration_s: float) -> None:
         self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))

@@ -13,10 +13,9 @@ from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
-    Refusal,
+    ModbusRefusal,
     RtuEngine,
     TcpEngine,
     answer,
@@ -28,7 +27,7 @@ from thermostand.drivers.sim.units.modbus import (
     writes_one,
     writes_words,
 )
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 
 
 class Store:
@@ -40,7 +39,7 @@ class Store:
 
     def _words(self, address: int, count: int) -> Sequence[int]:
         if address + count > 0x1000:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         return range(address, address + count)
 
     def _write(self, address: int, values: Sequence[int]) -> None:

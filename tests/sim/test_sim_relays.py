@@ -8,11 +8,10 @@ import pytest
 from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import RtuEngine
 from thermostand.drivers.sim.units.relays import FakeRelays
-from thermostand.drivers.sim.wire import PtyWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 START_NS = 1_700_000_000_000_000_000

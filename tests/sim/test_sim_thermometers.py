@@ -8,11 +8,10 @@ import struct
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
 from thermostand.drivers.sim.units.thermometers import FakeThermometers
-from thermostand.drivers.sim.wire import TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 START_NS = 1_700_000_000_000_000_000

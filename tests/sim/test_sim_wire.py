@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.drivers.sim.faults import LinkFaults
-from thermostand.drivers.sim.wire import PtyWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire
 
 
 class Echo:

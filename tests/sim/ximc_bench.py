@@ -1,14 +1,12 @@
 """A simulated stage on the bench: its controller on one connection, and both clocks in hand."""
 
 import struct
-import threading
-from collections.abc import Callable
-from typing import Literal, NamedTuple, cast
+from typing import Literal, NamedTuple
 
+from tests.still_plant import StillPlant
 from thermostand.drivers.framing.ximc import Damage, decode, encode
 from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
-from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000
@@ -25,18 +23,6 @@ RUNNING, FAILED = 0x80, 0x40
 MOVE, MOVR, LEFT, RIGT, STOP, HOME, LOFT, SSTP = range(1, 9)
 POWER_OFF, POWER_NORMAL, POWER_REDUCED = 1, 3, 4
 ERRC, ERRD, ERRV, EEPROM, HOMED, ALARM, CTP_ERROR, SWAPPED = 0x1, 0x2, 0x4, 0x10, 0x20, 0x40, 0x80, 0x8000
-
-
-class Laboratory:
-    """The part of the plant a stage uses."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.linear_mm_at: Callable[[int], float] = lambda _: -1.0
-        self.rotary_deg_at: Callable[[int], float] = lambda _: -1.0
-
-    def advance(self, now_ns: int) -> None:
-        pass
 
 
 class Status(NamedTuple):
@@ -68,10 +54,10 @@ class Bench:
     """A stage, its controller on one connection, and both clocks in hand."""
 
     def __init__(self, attach: Literal["linear", "rotary"], start_steps: float = 2_000.0) -> None:
-        self.plant = Laboratory()
+        self.plant = StillPlant(T0)
         self.clock = FollowedClock(T0)
         profile = LINEAR_8MT160_300 if attach == "linear" else ROTARY_8MR151
-        self.axis = FakeAxis(cast(Plant, self.plant), self.clock, profile, 0x1234, attach, start_steps)
+        self.axis = FakeAxis(self.plant, self.clock, profile, 0x1234, attach, start_steps)
         self.real_s = 0.0
         self.engine = self.axis.engine(lambda: self.real_s)
 

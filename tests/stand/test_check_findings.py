@@ -7,7 +7,7 @@ import pytest
 
 from thermostand.drivers.devices.cameras.cameras_by_protocol import packet_finding
 from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings, imager_finding
-from thermostand.drivers.sim.units.radiometric import HEIGHT, WIDTH, Shot, jpeg_of
+from thermostand.drivers.sim.units.thermal_imager import HEIGHT, WIDTH, RadiometricShot, jpeg_of
 
 WARM = np.full((HEIGHT, WIDTH), 31.0)
 
@@ -24,7 +24,7 @@ def test_the_newest_picture_of_an_imager_is_looked_at(tmp_path: Path):
         f"{tmp_path / 'card'} cannot be read (No such file or directory)",
     )
     assert looked(tmp_path)[:2] == ("reading", "unverified")
-    (tmp_path / "IR_0001.jpg").write_bytes(jpeg_of(Shot(WARM, 1.7e9)))
+    (tmp_path / "IR_0001.jpg").write_bytes(jpeg_of(RadiometricShot(WARM, 1.7e9)))
     what, verdict, text = looked(tmp_path, serial_number="49001234")
     assert (what, verdict) == ("reading", "ok")
     assert text == "FLIR E40, serial number 49001234; its newest picture, IR_0001.jpg, shows lens 31.0 degC"
@@ -34,7 +34,7 @@ def test_the_newest_picture_of_an_imager_is_looked_at(tmp_path: Path):
         "settings",
         "failed",
     )  # nor by a run
-    odd = Shot(
+    odd = RadiometricShot(
         WARM - np.where(np.arange(WIDTH) < 9, 10.0, 0.0), 1.7e9, spots={"": (4, 4)}
     )  # a measurement without a name
     (tmp_path / "IR_0001.jpg").write_bytes(jpeg_of(odd))

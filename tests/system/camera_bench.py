@@ -1,7 +1,6 @@
 """A camera driver, through Aravis, and our own GigE Vision camera before it on a loopback address."""
 
 import asyncio
-import threading
 from collections.abc import AsyncGenerator, Generator
 from contextlib import asynccontextmanager, contextmanager
 
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.addresses import usual_camera_address
+from tests.still_plant import StillPlant
 from thermostand.drivers.devices.cameras.camera_gige import Camera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
@@ -20,33 +20,13 @@ START_NS = 1_700_000_000 * NS_PER_S
 EXPOSURE_S = 0.05
 
 
-class WarmPlant:
-    """As much of a plant as a camera sees."""
-
-    def __init__(self, now_ns: int) -> None:
-        self.sensor_degC = 41.5
-        self.body_degC = 38.0
-        self.camera_power_on_ns: int | None = now_ns
-        self.camera_powered = True
-        self.lock = threading.RLock()
-
-    def advance(self, now_ns: int) -> None:
-        """Nothing changes here."""
-
-    def switch_camera(self, now_ns: int, *, on: bool) -> None:
-        with self.lock:
-            self.camera_powered = on
-            if on:
-                self.camera_power_on_ns = now_ns
-
-
 def noise(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT_px) -> NDArray[np.uint8]:
     """An image that belongs to one instant only."""
     return np.random.default_rng(time_ns).integers(0, 256, (HEIGHT_px, WIDTH_px), dtype=np.uint8)[:rows]
 
 
 @contextmanager
-def simulated(clock: WallClock | FollowedClock, plant: WarmPlant, serial: str = SERIAL) -> Generator[FakeCamera]:
+def simulated(clock: WallClock | FollowedClock, plant: StillPlant, serial: str = SERIAL) -> Generator[FakeCamera]:
     real_time = isinstance(clock, WallClock)
     fake = FakeCamera(
         plant,
@@ -81,7 +61,7 @@ async def opened(clock: WallClock | VirtualClock | None = None, **changes: objec
 
 
 @asynccontextmanager
-async def virtual(plant: WarmPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
+async def virtual(plant: StillPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
     """A simulated camera that follows a virtual clock."""
     followed = FollowedClock(START_NS)
     with simulated(followed, plant) as fake:

@@ -11,7 +11,8 @@ import yaml
 from tests.addresses import move_to_free
 from tests.forked import OWN_HELPERS
 from tests.sections import change
-from tests.system.camera_bench import START_NS, WarmPlant, simulated
+from tests.still_plant import StillPlant
+from tests.system.camera_bench import START_NS, simulated
 from thermostand.drivers.framing.aravis_library import library
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.foundation.clock import WallClock
@@ -154,13 +155,13 @@ def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Calla
 
 
 @pytest.fixture
-def plant() -> WarmPlant:
+def plant() -> StillPlant:
     """What a camera by itself sees."""
-    return WarmPlant(START_NS)
+    return StillPlant(START_NS, sensor=41.5, body=38.0)
 
 
 @pytest.fixture
-def fake(plant: WarmPlant) -> Iterator[FakeCamera]:
+def fake(plant: StillPlant) -> Iterator[FakeCamera]:
     """A camera in real time."""
     with simulated(WallClock(), plant) as camera:
         yield camera

@@ -3,16 +3,14 @@
 import asyncio
 import errno
 import struct
-import threading
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
-from typing import cast
 
 from usb.core import USBError
 
+from tests.still_plant import StillPlant
 from thermostand.drivers.devices.motion.flap import Flap, FlapSettings
 from thermostand.drivers.sim.motion.flap import MAX_DUTY_FORWARD, FakeFlap
-from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer
 from thermostand.foundation.clock import FollowedClock, VirtualClock, seconds_ns
 from thermostand.foundation.readings import Quality, Reading
@@ -23,25 +21,14 @@ SETTINGS = FlapSettings(serial_number=OURS, open_target=3500, closed_target=500,
 SET_TARGET, STOP_MOTOR, GET_VARIABLES, GET_RAM_SETTINGS = 0x84, 0x87, 0xE5, 0xEA
 
 
-class Laboratory:
-    """The part of the plant a flap uses."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.flap_open_at: Callable[[int], float] = lambda _: -1.0
-
-    def advance(self, now_ns: int) -> None:
-        pass
-
-
 class TappedFlap(FakeFlap):
     """Notes its requests; `failures` are for the coming ones of a number, `short` how many reads are cut short."""
 
-    def __init__(self, plant: Laboratory, clock: FollowedClock, serial_number: str) -> None:
+    def __init__(self, plant: StillPlant, clock: FollowedClock, serial_number: str) -> None:
         self.requests: list[tuple[int, int]] = []  # request, value
         self.failures: list[tuple[int, TransferFailed]] = []
         self.short = 0
-        super().__init__(cast(Plant, plant), clock, serial_number)
+        super().__init__(plant, clock, serial_number)
 
     def control_transfer(
         self, request_type: int, request: int, value: int, index: int, length_or_data: int | bytes
@@ -77,7 +64,7 @@ class Bench:
     """Two controllers on one bus, ours the second; one virtual time for them and the driver."""
 
     def __init__(self) -> None:
-        self.plant = Laboratory()
+        self.plant = StillPlant(T0)
         self.followed = FollowedClock(T0)
         self.other = TappedFlap(self.plant, self.followed, OTHER)
         self.fake = TappedFlap(self.plant, self.followed, OURS)

@@ -2,19 +2,17 @@
 
 import asyncio
 import struct
-import threading
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
+from tests.still_plant import StillPlant
 from thermostand.drivers.devices.motion.stage import Axis, AxisSettings
 from thermostand.drivers.framing.ximc import encode
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.motion.ximc import FakeAxis, XimcEngine
 from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
-from thermostand.drivers.sim.physics.plant import Plant
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.foundation.clock import FollowedClock, VirtualClock, seconds_ns
 from thermostand.foundation.readings import Reading
 
@@ -27,18 +25,6 @@ LIMITS = {"linear": (0.0, 299.95), "rotary": (-40.0, 40.0)}
 ENGINE_LAYOUT = "<HHIBHhBH12x"  # microstep mode is field 6
 
 Kind = Literal["linear", "rotary"]
-
-
-class Laboratory:
-    """The part of the plant a stage uses."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.linear_mm_at: Callable[[int], float] = lambda _: -1.0
-        self.rotary_deg_at: Callable[[int], float] = lambda _: -1.0
-
-    def advance(self, now_ns: int) -> None:
-        pass
 
 
 class Tap:
@@ -76,7 +62,7 @@ class Bench:
 
     def __init__(self, kind: Kind, wire: str, folder: Path) -> None:
         self.kind: Kind = kind
-        self.plant = Laboratory()
+        self.plant = StillPlant(T0)
         self.followed = FollowedClock(T0)
         self.clock = VirtualClock(T0, self._advance)
         self.trajectory: list[float] = []  # mechanical, whenever time moved since the last move began
@@ -95,9 +81,7 @@ class Bench:
 
     def controller(self, serial_number: int) -> FakeAxis:
         profile = LINEAR_8MT160_300 if self.kind == "linear" else ROTARY_8MR151
-        return FakeAxis(
-            cast(Plant, self.plant), self.followed, profile, serial_number, self.kind, START_STEPS[self.kind]
-        )
+        return FakeAxis(self.plant, self.followed, profile, serial_number, self.kind, START_STEPS[self.kind])
 
     def plug(self, tap: Tap, wire: str = "serial", port: int = 0) -> PtyWire | TcpWire:
         if wire == "serial":

@@ -93,13 +93,13 @@ KIND = DeviceKind(
 )
 '''
 FAKE = """
-from thermostand.drivers.sim.wire import Lines
+from thermostand.drivers.sim.wire import LineEngine
 
 
 class FakeLamp:
     def __init__(self, bench, name, settings):
         self.percent = 0.0
-        bench.listen(name, settings["address"], lambda: Lines(self.answer))
+        bench.listen(name, settings["address"], lambda: LineEngine(self.answer))
 
     def answer(self, line):
         if line.strip() != b"?":

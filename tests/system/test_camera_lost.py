@@ -7,10 +7,10 @@ import sys
 import pytest
 
 from tests.addresses import usual_camera_address
+from tests.still_plant import StillPlant
 from tests.system.camera_bench import (
     EXPOSURE_S,
     HEIGHT_px,
-    WarmPlant,
     WIDTH_px,
     noise,
     opened,
@@ -31,7 +31,7 @@ def aravis() -> None:
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.05, 1), (0.01, 10)])
-async def test_lost_packets_are_asked_for_again_and_no_bit_differs(plant: WarmPlant, loss: float, burst: int):
+async def test_lost_packets_are_asked_for_again_and_no_bit_differs(plant: StillPlant, loss: float, burst: int):
     async with virtual(plant) as (clock, fake), opened(clock, packet_size=1500) as camera:
         fake.faults.loss, fake.faults.burst = loss, burst
         for _ in range(3):
@@ -41,7 +41,7 @@ async def test_lost_packets_are_asked_for_again_and_no_bit_differs(plant: WarmPl
         assert camera.counters()["n_resent_packets"] > 10
 
 
-async def test_without_resend_a_frame_with_holes_is_never_used(plant: WarmPlant, monkeypatch: pytest.MonkeyPatch):
+async def test_without_resend_a_frame_with_holes_is_never_used(plant: StillPlant, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 4.0)  # what each of three frames is waited for
     monkeypatch.setattr(camera_connection, "FRAME_RETENTION_PERIODS", 0.4)  # a busy machine hears of it in time
     async with virtual(plant) as (clock, fake):
@@ -57,7 +57,7 @@ async def test_without_resend_a_frame_with_holes_is_never_used(plant: WarmPlant,
     assert (frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)).all()
 
 
-async def test_three_missing_frames_of_a_free_run_are_a_lost_camera(plant: WarmPlant, monkeypatch: pytest.MonkeyPatch):
+async def test_three_missing_frames_of_a_free_run_are_a_lost_camera(plant: StillPlant, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 0.5)  # what each of three frames is waited for
     async with virtual(plant) as (clock, fake), opened(clock, trigger="free_run", frame_rate_hz=2) as camera:
         await camera.grab()
@@ -96,7 +96,7 @@ async def test_a_trigger_executed_twice_does_not_leave_an_old_frame_behind(fake:
         assert camera.counters()["stale"] >= 1
 
 
-async def test_after_a_power_cycle_open_makes_everything_new(fake: FakeCamera, plant: WarmPlant):
+async def test_after_a_power_cycle_open_makes_everything_new(fake: FakeCamera, plant: StillPlant):
     clock = WallClock()
     asked: dict[str, object] = {
         "gain_dB": 6.0,

@@ -6,7 +6,8 @@ from collections.abc import AsyncGenerator
 
 import pytest
 
-from tests.system.camera_bench import WarmPlant, noise, opened, simulated, virtual
+from tests.still_plant import StillPlant
+from tests.system.camera_bench import noise, opened, simulated, virtual
 from thermostand.drivers.devices.cameras.camera_gige import Camera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvsp_sender import StreamSender
@@ -19,7 +20,7 @@ FRAMES = 5
 
 
 @pytest.fixture
-async def wired(plant: WarmPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
+async def wired(plant: StillPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
     async with virtual(plant) as both:
         yield both
 
@@ -66,7 +67,7 @@ async def test_packets_that_come_twice_or_late_make_the_same_frame(wired: tuple[
 
 
 @pytest.mark.parametrize("fault", ["leader_early_s", "stretch_s"])
-async def test_a_frame_is_waited_for_until_the_next_one_is_due(plant: WarmPlant, fault: str):
+async def test_a_frame_is_waited_for_until_the_next_one_is_due(plant: StillPlant, fault: str):
     """In real time: Aravis' own patience, 0.1 s behind the last packet, would give up a camera that sends its leader
     with the begin of the exposure."""
     with simulated(WallClock(), plant) as fake:

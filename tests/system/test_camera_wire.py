@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from tests.still_plant import StillPlant
 from tests.system.camera_bench import (
     EXPOSURE_S,
     SERIAL,
     START_NS,
-    WarmPlant,
     noise,
     opened,
     settings,
@@ -33,7 +33,7 @@ def aravis() -> None:
 
 
 @pytest.mark.parametrize("wanted", [SERIAL, None], ids=["of a configured number", "of any number"])
-async def test_another_camera_at_the_address_of_the_first_gets_no_setting(plant: WarmPlant, wanted: str | None):
+async def test_another_camera_at_the_address_of_the_first_gets_no_setting(plant: StillPlant, wanted: str | None):
     """Control is taken, which Aravis does when it opens one; nothing else is written."""
     with simulated(WallClock(), plant):
         camera = Camera("camera", settings(serial_number=wanted), WallClock())
@@ -66,7 +66,7 @@ async def test_aravis_finds_a_packet_size_larger_than_an_ethernet_frame_on_loopb
         assert camera.effective.packet_size > 8000
 
 
-async def test_under_virtual_time_a_trigger_stamps_the_middle_of_the_exposure_to_the_nanosecond(plant: WarmPlant):
+async def test_under_virtual_time_a_trigger_stamps_the_middle_of_the_exposure_to_the_nanosecond(plant: StillPlant):
     async with virtual(plant) as (clock, _), opened(clock) as camera:
         for number in range(3):
             await clock.sleep_until(START_NS + number * 600 * NS_PER_S)
@@ -77,7 +77,7 @@ async def test_under_virtual_time_a_trigger_stamps_the_middle_of_the_exposure_to
             assert (frame.block_id, frame.dropped, frame.camera_degC) == (number + 1, 0, 41.5)
 
 
-async def test_under_virtual_time_a_free_run_gives_the_next_frame_and_never_an_old_one(plant: WarmPlant):
+async def test_under_virtual_time_a_free_run_gives_the_next_frame_and_never_an_old_one(plant: StillPlant):
     async with virtual(plant) as (clock, _):
         started_ns = START_NS + 5 * NS_PER_S
         await clock.sleep_until(started_ns)  # or the camera's clock would still show 0: no time stamps
@@ -120,7 +120,7 @@ async def test_in_a_free_run_the_periods_without_a_frame_are_counted(fake: FakeC
         assert (await camera.grab()).dropped == 0
 
 
-async def test_an_exposure_may_change_from_frame_to_frame_of_a_free_run(plant: WarmPlant):
+async def test_an_exposure_may_change_from_frame_to_frame_of_a_free_run(plant: StillPlant):
     async with virtual(plant) as (clock, _):
         await clock.sleep_until(START_NS + 5 * NS_PER_S)
         async with opened(clock, trigger="free_run") as camera:

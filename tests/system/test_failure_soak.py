@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.drivers.sim.faults import LinkFaults
 from thermostand.drivers.sim.units.modbus import Handler, RtuEngine, TcpEngine, answer, reads_bits, reads_words
-from thermostand.drivers.sim.wire import PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import Space
 from thermostand.foundation.clock import WallClock

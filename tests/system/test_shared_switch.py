@@ -10,7 +10,7 @@ import pytest
 
 from tests.system.conftest import require_aravis
 from tests.system.test_several_cameras import simulated
-from thermostand.drivers.sim.gige.switch import Switch
+from thermostand.drivers.sim.gige.gvsp_sender import Switch
 from thermostand.foundation.clock import WallClock, seconds_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Frame

@@ -18,9 +18,8 @@ from pathlib import Path
 
 from tests.torture.case import Case, Fault, read_case
 from thermostand.drivers.sim.control import serve_control
-from thermostand.drivers.sim.fault_schedule import FaultSchedule, PlannedFault
-from thermostand.drivers.sim.laboratory import Laboratory
-from thermostand.drivers.sim.laboratory_spec import LaboratorySpec
+from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
+from thermostand.drivers.sim.laboratory_faults import FaultSchedule, PlannedFault
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.ending import Ending

@@ -9,23 +9,148 @@ from __future__ import annotations
 import math
 import socket
 import threading
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.drivers.sim.gige import gvcp, gvsp
-from thermostand.drivers.sim.gige.camera_registers import Registers
-from thermostand.drivers.sim.gige.camera_schedule import Schedule, Shot
+from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Peer, Registers
 from thermostand.drivers.sim.gige.dressed_registers import DressedRegisters
-from thermostand.drivers.sim.gige.genicam import TICKS_PER_S, features
+from thermostand.drivers.sim.gige.genicam import TICKS_PER_S, MAX_RATE_Hz, features
 from thermostand.drivers.sim.gige.genicam_file import GenicamFile
-from thermostand.drivers.sim.gige.gvcp import Nack, Resend, Status
-from thermostand.drivers.sim.gige.gvcp_device import ControlChannel, Peer
-from thermostand.drivers.sim.gige.gvsp_pixels import binned, encoded
+from thermostand.drivers.sim.gige.gvcp import GvcpStatus, Nack, Resend
+from thermostand.drivers.sim.gige.gvsp import binned, encoded
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamCounts, StreamSender
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
+
+# When the camera exposes: software trigger and free run as a function of the clock; no thread, no socket.
+
+
+_IDLE_ns = NS_PER_S
+_SINGLE_FRAME = 1
+_SOFTWARE = 0
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure, [start, start + exposure]; `index` counts from 0 at AcquisitionStart, missed frames included."""
+
+    acquisition: int
+    index: int
+    start_ns: int
+    exposure_ns: int
+    gain_dB: float
+
+    @property
+    def middle_ns(self) -> int:
+        """The instant that the image shows."""
+        return self.start_ns + self.exposure_ns // 2
+
+
+class Schedule:
+    """The exposures of one camera; settings are read from its registers as they are needed.
+
+    With `real_time` a triggered exposure is due when it has ended. Without, it is due at once: virtual time stands
+    still while the client waits for its frame. A free-running exposure is always due when it has ended.
+    """
+
+    def __init__(self, registers: Registers, real_time: bool) -> None:
+        self._registers = registers
+        self._real_time = real_time
+        self._acquisition = 0
+        self._anchor_ns = 0
+        self._anchor_index = self._next_index = 0
+        self._triggered: deque[Exposure] = deque()
+        self.streaming = False
+
+    def start(self, now_ns: int) -> None:
+        """AcquisitionStart."""
+        if self.streaming:
+            return
+        self._acquisition += 1
+        self._anchor_ns = now_ns
+        self._anchor_index = self._next_index = 0
+        self._set_streaming(True)
+
+    def stop(self) -> None:
+        """AcquisitionStop; exposures under way are lost."""
+        self._acquisition += 1
+        self._triggered.clear()
+        self._set_streaming(False)
+
+    def reschedule(self, now_ns: int) -> None:
+        """The rate or the trigger was changed: the free run continues from here."""
+        self._anchor_ns, self._anchor_index = now_ns, self._next_index
+
+    def trigger(self, now_ns: int) -> None:
+        """TriggerSoftware; without effect unless the camera waits for it."""
+        if self.streaming and self._triggering() and self._registers.integer("TriggerSource") == _SOFTWARE:
+            self._triggered.append(self._expose(self._next_index, now_ns))
+
+    def is_current(self, shot: Exposure) -> bool:
+        """The acquisition that the exposure belongs to has not been stopped."""
+        return shot.acquisition == self._acquisition
+
+    @property
+    def is_free_running(self) -> bool:
+        """It exposes as time goes on, without being triggered."""
+        return self.streaming and not self._triggering()
+
+    def due(self, now_ns: int) -> tuple[Exposure | None, int]:
+        """The exposure to read out now, if any, and when to look again (ns)."""
+        shot, again_ns = self._due(now_ns)
+        if shot is not None and self._registers.integer("AcquisitionMode") == _SINGLE_FRAME:
+            self._set_streaming(False)
+        return shot, again_ns
+
+    def _due(self, now_ns: int) -> tuple[Exposure | None, int]:
+        if not self.streaming:
+            return None, now_ns + _IDLE_ns
+        return self._due_triggered(now_ns) if self._triggering() else self._due_free_running(now_ns)
+
+    def _due_triggered(self, now_ns: int) -> tuple[Exposure | None, int]:
+        if not self._triggered:
+            return None, now_ns + _IDLE_ns
+        end_ns = self._triggered[0].start_ns + self._triggered[0].exposure_ns
+        if self._real_time and end_ns > now_ns:
+            return None, end_ns
+        return self._triggered.popleft(), now_ns
+
+    def _due_free_running(self, now_ns: int) -> tuple[Exposure | None, int]:
+        """The latest frame whose exposure has ended; those missed in between only cost their ids."""
+        period_ns, exposure_ns = self._period_ns(), self._exposure_ns()
+        latest = self._anchor_index + (now_ns - exposure_ns - self._anchor_ns) // period_ns
+        index = max(latest, self._next_index)
+        start_ns = self._anchor_ns + (index - self._anchor_index) * period_ns
+        if latest < index:
+            return None, start_ns + exposure_ns
+        return self._expose(index, start_ns), now_ns
+
+    def _expose(self, index: int, start_ns: int) -> Exposure:
+        self._next_index = index + 1
+        return Exposure(self._acquisition, index, start_ns, self._exposure_ns(), self._registers.real("Gain"))
+
+    def _triggering(self) -> bool:
+        return self._registers.integer("TriggerMode") == 1
+
+    def _exposure_ns(self) -> int:
+        return round(self._registers.real("ExposureTime") * 1000)
+
+    def _period_ns(self) -> int:
+        """Of the free run: as asked for, but never shorter than the exposure."""
+        enabled = self._registers.integer("AcquisitionFrameRateEnable")
+        rate_Hz = self._registers.real("AcquisitionFrameRate") if enabled else MAX_RATE_Hz
+        return max(round(NS_PER_S / rate_Hz), self._exposure_ns())
+
+    def _set_streaming(self, streaming: bool) -> None:
+        self.streaming = streaming
+        self._registers.put("TLParamsLocked", int(streaming))
+
 
 Render = Callable[[int, float, float, int], NDArray[np.uint8]]
 
@@ -38,25 +163,7 @@ _SHORT_IDS = 0xFFFF
 _TIMING = ("ExposureTime", "AcquisitionFrameRate", "AcquisitionFrameRateEnable", "TriggerMode", "TriggerSource")
 
 
-class CameraPlant(Protocol):
-    """What the camera needs of drivers.sim.physics.plant.Plant."""
-
-    sensor_degC: float
-    body_degC: float
-    camera_power_on_ns: int | None
-    lock: threading.RLock
-
-    @property
-    def camera_powered(self) -> bool:
-        """Whether the camera's supply is on."""
-        ...
-
-    def advance(self, now_ns: int) -> None:
-        """Bring the physics up to date."""
-        ...
-
-
-class Thermometers(Protocol):
+class CameraThermometers(Protocol):
     """What a camera's temperatures are read from: the plant, or a camera's own physics."""
 
     @property
@@ -85,7 +192,7 @@ class FakeCamera:
 
     def __init__(
         self,
-        plant: CameraPlant,
+        plant: Plant,
         clock: Now,
         render: Render,
         address: str,
@@ -99,7 +206,7 @@ class FakeCamera:
         extended_ids: bool = False,
         faults: CameraFaults | None = None,
         genicam: GenicamFile | None = None,
-        thermometers: Thermometers | None = None,
+        thermometers: CameraThermometers | None = None,
     ) -> None:
         self.address = address
         self._plant = plant
@@ -241,9 +348,7 @@ class FakeCamera:
 
     def _reply(self, datagram: bytes, peer: Peer) -> bytes:
         """The answer to a datagram; an empty one is a tick of the heartbeat timer."""
-        with self._wake:
-            now_ns = self._clock.now_ns()
-            self._plant.advance(now_ns)
+        with self._plant.at(self._clock) as now_ns:
             self._observe_power(now_ns)
             heard_s = boot_time_ns() / NS_PER_S  # a camera's timer runs on while the host is suspended
             self._channel.check_heartbeat(heard_s)
@@ -261,7 +366,7 @@ class FakeCamera:
             return
         fault = self.faults.temperature
         if fault == "access":
-            raise Nack(Status.ACCESS_DENIED, "the temperature sensor does not answer")
+            raise Nack(GvcpStatus.ACCESS_DENIED, "the temperature sensor does not answer")
         if fault == "stuck":
             return
         sensor = self._registers.integer("DeviceTemperatureSelector") == 0
@@ -331,7 +436,7 @@ class FakeCamera:
             image = self._render(shot.middle_ns, shot.exposure_ns / NS_PER_S, shot.gain_dB, rows)
             self._send(shot, image)
 
-    def _next_shot(self) -> Shot | None:
+    def _next_shot(self) -> Exposure | None:
         """Wait for the next exposure to read out; None when the camera is closed."""
         with self._wake:
             while not self._closed:
@@ -342,7 +447,7 @@ class FakeCamera:
                 self._wake.wait(min((again_ns - now_ns) / NS_PER_S, PIECE_S) if self._real_time else None)
         return None
 
-    def _send(self, shot: Shot, image: NDArray[np.uint8]) -> None:
+    def _send(self, shot: Exposure, image: NDArray[np.uint8]) -> None:
         """Send the image and return when it has left; nothing when the acquisition was stopped meanwhile."""
         with self._plant.lock:
             destination = self._destination()
@@ -352,7 +457,7 @@ class FakeCamera:
             sending = self._sender.begin(self._block(shot, image), destination, gap_s)
         sending.wait()
 
-    def _block(self, shot: Shot, image: NDArray[np.uint8]) -> gvsp.Block:
+    def _block(self, shot: Exposure, image: NDArray[np.uint8]) -> gvsp.ImageBlock:
         value = self._registers.integer
         x, y, width, height = value("OffsetX"), value("OffsetY"), value("Width"), value("Height")
         pixels = binned(image, *self._registers.binning)[y : y + height, x : x + width]
@@ -365,7 +470,7 @@ class FakeCamera:
         data = encoded(pixels, gvsp.PixelFormat(value("PixelFormat")))
         leader = gvsp.Leader(self._stamp(shot.start_ns), value("PixelFormat"), width, height, x, y)
         block_id = shot.index + 1 if self._extended_ids else shot.index % _SHORT_IDS + 1
-        return gvsp.Block(block_id, leader, memoryview(data), value("GevSCPSPacketSize"), self._extended_ids)
+        return gvsp.ImageBlock(block_id, leader, memoryview(data), value("GevSCPSPacketSize"), self._extended_ids)
 
     def _stamp(self, start_ns: int) -> int:
         """The leader's time stamp; backwards: every exposure a second before the one before it."""

@@ -7,6 +7,8 @@ ours.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 
@@ -14,9 +16,7 @@ from thermostand.drivers.framing.aravis_library import AravisError
 from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.camera_registers import BOOTSTRAP_bytes, Registers, largest
 from thermostand.drivers.sim.gige.genicam import Feature
-from thermostand.drivers.sim.gige.genicam_file import GenicamFile
-from thermostand.drivers.sim.gige.genicam_memory import Evaluated
-from thermostand.drivers.sim.gige.genicam_start import COMMANDS, TEMPERATURES, reach, start_values
+from thermostand.drivers.sim.gige.genicam_file import Evaluated, GenicamFile
 from thermostand.drivers.sim.gige.gvsp import PixelFormat
 from thermostand.foundation.errors import ConfigError
 
@@ -122,7 +122,7 @@ class DressedRegisters(Registers):
         try:
             changed = self._wear()
         except ConfigError as error:
-            raise gvcp.Nack(gvcp.Status.BAD_PARAMETER, str(error)) from error
+            raise gvcp.Nack(gvcp.GvcpStatus.BAD_PARAMETER, str(error)) from error
         return (*changed, *(name for name, register in given.items() if register))
 
     # ---------------------------------------------------------------------------------------------------- the clothes
@@ -176,3 +176,303 @@ class DressedRegisters(Registers):
         if "AcquisitionMode" in file:
             worn["AcquisitionMode"] = int(self._file.entry("AcquisitionMode") == "SingleFrame")
         return worn
+
+
+# Sensible start values of a camera whose file is known and whose registers are not.
+#
+# A feature is there when the registers that say so do; a value is what its registers make of it. Where Aravis cannot
+# write a node (a formula has no inverse), the registers it is made of are tried until it evaluates as wanted.
+
+
+# What a camera of these wants is there: enumerations with the entries that matter, from the GenICam files of 12 makes.
+ENTRIES = {
+    "PixelFormat": ("Mono8", "Mono10", "Mono12", "Mono16", "Mono10Packed", "Mono12Packed", "Mono10p", "Mono12p"),
+    "AcquisitionMode": ("Continuous", "SingleFrame"),
+    "TriggerSelector": ("FrameStart", "FrameBurstStart", "ExposureStart", "AcquisitionStart"),
+    "TriggerMode": ("Off", "On"),
+    "TriggerSource": ("Software", "SoftwareTrigger", "SoftTrigger", "FixedRate"),
+    "ExposureMode": ("Timed",),
+    "ExposureAuto": ("Off",),
+    "GainAuto": ("Off",),
+    "AcquisitionFrameRateAuto": ("Off",),
+    "GainSelector": ("All", "AnalogAll"),
+    "DeviceTemperatureSelector": ("Sensor", "Mainboard"),
+    "TemperatureSelector": ("Sensorboard", "Coreboard"),
+}
+_OF_A_CAMERA = ("Width", "Height", "PixelFormat", "PayloadSize")  # what lacks one of them is refused for that
+_USUAL = "Mono8"
+COMMANDS = ("AcquisitionStart", "AcquisitionStop", "TriggerSoftware")
+TEMPERATURES = ("DeviceTemperature", "TemperatureAbs", "CurrentTemperature")
+ROOM_degC = 40.0
+
+# Feature: value, minimum, maximum, increment; None for the sensor's width or height.
+Wish = tuple[float | None, float | None, float | None, float]
+Limit = tuple[str, float]
+WISHES: dict[str, Wish] = {
+    **dict.fromkeys(("SensorWidth", "WidthMax", "SensorHeight", "HeightMax"), (None, None, None, 1)),
+    **dict.fromkeys(("BinningHorizontal", "BinningVertical"), (1, 1, 4, 1)),
+    **dict.fromkeys(("OffsetX", "OffsetY"), (0, 0, None, 1)),
+    **dict.fromkeys(("Width", "Height"), (None, 16, None, 4)),
+    "ExposureTimeBaseAbs": (20, None, None, 1),
+    **dict.fromkeys(("ExposureTime", "ExposureTimeAbs"), (10_000, 20, 10e6, 1)),
+    "ExposureTimeRaw": (10_000, 1, 10e6, 1),
+    **dict.fromkeys(("Gain", "GainAbs"), (0, 0, 24, 1)),
+    "GainRaw": (0, 0, 480, 1),
+    **dict.fromkeys(("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"), (0, None, None, 1)),
+    **dict.fromkeys(("AcquisitionFrameRate", "AcquisitionFrameRateAbs"), (10, 0.01, 14, 1)),
+    **dict.fromkeys(TEMPERATURES, (ROOM_degC, None, None, 1)),
+}
+
+WRITTEN = ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw")
+
+_NEAR, _NEAR_ENOUGH = 1e-3, 0.03  # of a value; the second where a register has coarse steps
+_ALL_BITS = 2**32 - 1
+_LARGEST_RAW = float(2**31 - 1)  # of a register with a sign
+_BISECTIONS = 40
+_FILLERS = (1.0, 1e6)  # of a register that a formula multiplies by, or divides by, as a clock's ticks in a second
+
+
+def start_values(camera: Evaluated, width: int, height: int) -> tuple[str, ...]:
+    """Put them into the camera's memory: everything known is there, the sensor has width x height px unless the file
+    fixes another size. The features that stay at 0, or cannot be evaluated, whatever their registers hold."""
+    for names in ((*ENTRIES, *COMMANDS, *WISHES), *[(*ENTRIES, *WISHES)] * 2):  # some are there with a trigger only
+        _choose_entries(camera)  # selectors say which registers count
+        for condition in dict.fromkeys(_conditions(camera, names)):
+            _make_true(camera, condition)
+        for command in COMMANDS:
+            _make_effective(camera, command)
+    spared = {register for name in WISHES if name in camera.file for register in camera.file.registers(name)}
+    sides = {"Width": float(width), "Height": float(height)}
+    for name, (value, lowest, highest, step) in WISHES.items():
+        if name not in camera.file or _is_beside(camera, name):
+            continue
+        axis = "Height" if "Height" in name or name.endswith("Y") else "Width"
+        start = sides[axis] if value is None else value
+        reach(camera, name, start)
+        for bound, wanted in _limits(camera, name, (lowest, sides[axis] if highest is None else highest, step)):
+            reach(camera, bound, wanted, spared)
+            spared.update(camera.file.registers(bound))
+        reach(camera, name, start)
+        if name in WRITTEN:
+            _make_settable(camera, name, start)
+        if value is None and (fixed := _got(camera, name) or 0.0) > 0:
+            sides[axis] = min(sides[axis], fixed)
+    _choose_entries(camera)
+    return tuple(_unplayed(camera))
+
+
+def _unplayed(camera: Evaluated) -> Iterator[str]:
+    """Features of which the registers do not make what a camera's would; none where the file is no camera's."""
+    file = camera.file
+    if any(name not in file for name in _OF_A_CAMERA):
+        return
+    for name, (value, *_) in WISHES.items():
+        if name not in file or _is_beside(camera, name):
+            continue
+        is_mute = value != 0 and file.registers(name) and not _got(camera, name)
+        if is_mute or (name in WRITTEN and not _make_settable(camera, name, value or 0.0)):
+            yield name
+    yield from (name for name in COMMANDS if name in file and not _make_effective(camera, name))
+    formats = file.entries("PixelFormat") if file.registers("PixelFormat") else {}
+    if _USUAL in formats and camera.entry("PixelFormat") != _USUAL:
+        yield "PixelFormat"
+    for name in WRITTEN:
+        conditions = [each for each in file.conditions(name) if each in file] if name in file else []
+        if any(file.registers(each) and not _got(camera, each) for each in conditions):
+            yield name
+
+
+def _is_beside(camera: Evaluated, name: str) -> bool:
+    """Whether a feature is the raw one of another, which is set instead."""
+    return name == "ExposureTimeRaw" and "ExposureTimeAbs" in camera.file
+
+
+def _make_settable(camera: Evaluated, name: str, value: float) -> bool:
+    """Have a feature become what is written to it, by the registers that its formula looks at; whether it does. One
+    that cannot be written does, too."""
+    written = camera.file.written(name)
+    if not written or _takes(camera, name, value):
+        return True
+    unset = [each for each in camera.file.registers(name) if each not in written and not _got(camera, each)]
+    for filler in _FILLERS if unset else ():
+        for register in unset:
+            _quietly(camera.set, register, filler)
+        if _takes(camera, name, value):
+            return True
+    for register in unset:
+        _quietly(camera.set, register, 0.0)
+    reach(camera, name, value)
+    return False
+
+
+def _takes(camera: Evaluated, name: str, value: float) -> bool:
+    """Whether twice the value and the value can be written, or none can."""
+    try:
+        camera.set(name, 2 * value)
+        is_taken = _nearest(camera, name, 2 * value)
+        camera.set(name, value)
+    except AravisError:
+        return True
+    return is_taken and _nearest(camera, name, value)
+
+
+def _make_effective(camera: Evaluated, command: str) -> bool:
+    """Have a command change what it writes, by one of the registers that its formula looks at; whether it does."""
+    node = camera.file.named(command, "pValue") if command in camera.file else ""
+    if node not in camera.file:
+        return True
+    value, looked_at = camera.command_value(command), set(camera.file.registers(node)) - {*camera.file.written(node)}
+    if value == 0 or _is_taken(camera, node, value):
+        return True
+    for register in looked_at:
+        before = _got(camera, register) or 0.0
+        for tried in (1.0, 0.0):
+            _quietly(camera.set, register, tried)
+            if _is_taken(camera, node, value):
+                return True
+        _quietly(camera.set, register, before)
+    return False
+
+
+def _is_taken(camera: Evaluated, node: str, value: float) -> bool:
+    """Whether a node shows what is written to it; its registers are then as before."""
+    before = {register: _got(camera, register) for register in camera.file.written(node)}
+    _quietly(camera.set, node, value)
+    is_taken = _got(camera, node) == value
+    for register, was in before.items():
+        _quietly(camera.set, register, was or 0.0)
+    return is_taken
+
+
+def _limits(camera: Evaluated, name: str, wanted: tuple[float | None, float | None, float]) -> Iterator[Limit]:
+    """The nodes that bound a feature, and the raw values behind it, each with what it should be."""
+    for node in camera.file.reached(name):
+        values = wanted if node == name else (1.0, _LARGEST_RAW, 1.0)
+        for property_name, value in zip(("pMin", "pMax", "pInc"), values, strict=True):
+            bound = camera.file.named(node, property_name)
+            if value is not None and bound in camera.file and bound not in WISHES:
+                yield bound, value
+
+
+def _choose_entries(camera: Evaluated) -> None:
+    for name, entries in ENTRIES.items():
+        if name in camera.file and camera.file.kind(name) == "Enumeration":
+            offered = camera.file.entries(name)
+            first = next((entry for entry in entries if entry in offered and _is_offered(camera, offered[entry])), "")
+            if first:
+                _quietly(camera.choose, name, first)
+
+
+def _is_offered(camera: Evaluated, conditions: Iterable[str]) -> bool:
+    return all(_got(camera, condition) != 0 for condition in conditions if condition in camera.file)
+
+
+def reach(camera: Evaluated, name: str, value: float, spared: Collection[str] = ()) -> bool:
+    """Make a node evaluate to `value`, through its converters or by trying its registers but those spared; whether it
+    does."""
+    if _is(camera, name, value):
+        return True
+    own = [register for register in camera.file.registers(name) if register not in spared]
+    if not own:  # a constant of the file
+        return False
+    _quietly(camera.set, name, value)
+    if _is(camera, name, value):
+        return True
+    if any(_tried(camera, name, register, value) for register in own):
+        return True
+    unset = [register for register in own if _got(camera, register) == 0]
+    for filler in _FILLERS if unset else ():
+        for register in unset:
+            _quietly(camera.set, register, filler)
+        _quietly(camera.set, name, value)
+        if _is(camera, name, value) or any(_tried(camera, name, register, value) for register in own):
+            return True
+    return False
+
+
+def _tried(camera: Evaluated, name: str, register: str, value: float) -> bool:
+    """Try one register: the value itself, then where a rising or falling formula meets it."""
+    before = _got(camera, register)
+    if before is None:
+        return False
+    _quietly(camera.set, register, value)
+    if _is(camera, name, value):
+        return True
+    low, high = 1.0, _LARGEST_RAW  # not 0, by which a formula may divide
+    ends = [_with(camera, register, end, name) for end in (low, high)]
+    if ends[1] is None or ends[1] == ends[0]:  # a register of fewer bits takes no more
+        while high > 1 and (ends[1] is None or ends[1] == ends[0]):
+            high = (high - 1) / 2
+            ends[1] = _with(camera, register, high, name)
+    if None not in ends:
+        rises = (ends[1] or 0.0) > (ends[0] or 0.0)
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            found = _with(camera, register, middle, name)
+            if found is None or _is(camera, name, value):
+                break
+            low, high = (middle, high) if (found < value) == rises else (low, middle)
+        if _nearest(camera, name, value):
+            return True
+    _quietly(camera.set, register, before)
+    return False
+
+
+def _make_true(camera: Evaluated, condition: str) -> None:
+    """Make a condition hold, by as few registers as will do."""
+    if condition not in camera.file or (_got(camera, condition) or 0) != 0:
+        return
+    registers = camera.file.registers(condition)
+    choices: list[tuple[str, ...]] = [*((register,) for register in registers), registers]
+    for chosen in choices:
+        before = [int(_got(camera, register) or 0) for register in chosen]
+        for bits in (1, *(1 << bit for bit in range(31, 0, -1)), _ALL_BITS):
+            for register, was in zip(chosen, before, strict=True):
+                _quietly(camera.set, register, was | bits)  # other conditions are bits of the same register
+            if (_got(camera, condition) or 0) != 0:
+                return
+        for register, was in zip(chosen, before, strict=True):
+            _quietly(camera.set, register, was)
+
+
+def _conditions(camera: Evaluated, names: Iterable[str]) -> Iterator[str]:
+    """Of everything a camera is used for, entries and limits included."""
+    file = camera.file
+    for name in names:
+        if name not in file:
+            continue
+        yield from file.conditions(name)
+        for entry, conditions in (file.entries(name) if file.kind(name) == "Enumeration" else {}).items():
+            if entry in ENTRIES.get(name, ()):
+                yield from conditions
+
+
+def _with(camera: Evaluated, register: str, raw: float, name: str) -> float | None:
+    _quietly(camera.set, register, raw)
+    return _got(camera, name)
+
+
+def _nearest(camera: Evaluated, name: str, value: float) -> bool:
+    """Whether bisection came as near as a register's steps allow."""
+    found = _got(camera, name)
+    return found is not None and math.isclose(found, value, rel_tol=_NEAR_ENOUGH)
+
+
+def _is(camera: Evaluated, name: str, value: float) -> bool:
+    found = _got(camera, name)
+    return found is not None and math.isclose(found, value, rel_tol=_NEAR, abs_tol=1e-9)
+
+
+def _got(camera: Evaluated, name: str) -> float | None:
+    """The node's value; None when it cannot be evaluated (a register at an address that nothing stands for)."""
+    try:
+        return camera.get(name)
+    except AravisError:
+        return None
+
+
+def _quietly(write: Callable[..., None], *arguments: object) -> None:
+    try:
+        write(*arguments)
+    except AravisError:
+        return

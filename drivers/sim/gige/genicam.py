@@ -21,7 +21,7 @@ VERSION = "1.0"
 TICKS_PER_S = 1_000_000_000
 MAX_RATE_Hz = 14.0
 
-Kind = Literal["integer", "float", "string", "enumeration", "boolean", "command"]
+FeatureKind = Literal["integer", "float", "string", "enumeration", "boolean", "command"]
 Entries = tuple[tuple[str, int], ...]
 
 
@@ -35,7 +35,7 @@ class Feature:
     """
 
     name: str
-    kind: Kind
+    kind: FeatureKind
     address: int
     category: str | None
     access: Literal["RO", "RW"] = "RW"

@@ -24,7 +24,7 @@ _RESEND_EXTENDED = struct.Struct(">HHIIQ")
 _PACKET_ID_MASK = 0xFFFFFF
 
 
-class Command(IntEnum):
+class GvcpCommand(IntEnum):
     """Command codes; the acknowledge has the code plus one."""
 
     DISCOVERY = 0x0002
@@ -36,7 +36,7 @@ class Command(IntEnum):
     PENDING = 0x0088
 
 
-class Status(IntEnum):
+class GvcpStatus(IntEnum):
     """Status codes of an acknowledge; UNAVAILABLE also stands in a stream packet."""
 
     OK = 0x0000
@@ -59,13 +59,13 @@ class Malformed(ValueError):
 class Nack(Exception):
     """The command was understood and refused; `status` says why."""
 
-    def __init__(self, status: Status, reason: str) -> None:
+    def __init__(self, status: GvcpStatus, reason: str) -> None:
         super().__init__(f"{reason} ({status.name}, {status:#06x})")
         self.status = status
 
 
 @dataclass(frozen=True)
-class Request:
+class GvcpRequest:
     """A command; `command` may be a code that Command does not know."""
 
     command: int
@@ -85,7 +85,7 @@ class Ack:
     command: int
     req_id: int
     payload: bytes = b""
-    status: int = Status.OK
+    status: int = GvcpStatus.OK
 
     def encode(self) -> bytes:
         """The datagram."""
@@ -95,10 +95,10 @@ class Ack:
 def pending(request: bytes, time_ms: int) -> bytes:
     """PENDING_ACK to a command: its answer takes so long."""
     req_id = _COMMAND.unpack_from(request)[-1]
-    return Ack(Command.PENDING, req_id, struct.pack(">HH", 0, time_ms)).encode()
+    return Ack(GvcpCommand.PENDING, req_id, struct.pack(">HH", 0, time_ms)).encode()
 
 
-def decode_request(datagram: bytes) -> Request:
+def decode_request(datagram: bytes) -> GvcpRequest:
     """The command in a datagram; bytes behind its stated length are ignored. Malformed when it is none."""
     if len(datagram) < _COMMAND.size:
         raise Malformed(f"{len(datagram)} bytes are no GVCP header")
@@ -107,7 +107,7 @@ def decode_request(datagram: bytes) -> Request:
         raise Malformed(f"key {key:#04x} instead of {_KEY:#04x}")
     if command == _NO_COMMAND:
         raise Malformed(f"command {command:#06x}, which no acknowledge can answer")
-    return Request(command, req_id, _body(datagram, length), flags)
+    return GvcpRequest(command, req_id, _body(datagram, length), flags)
 
 
 def _body(datagram: bytes, length: int) -> bytes:
@@ -123,19 +123,19 @@ def _body(datagram: bytes, length: int) -> bytes:
 def unpack_words(payload: bytes) -> tuple[int, ...]:
     """The 32-bit words of a payload; Nack when it is empty or no multiple of 4 bytes."""
     if not payload or len(payload) % 4:
-        raise Nack(Status.BAD_PARAMETER, f"{len(payload)} bytes are no words")
+        raise Nack(GvcpStatus.BAD_PARAMETER, f"{len(payload)} bytes are no words")
     return struct.unpack(f">{len(payload) // 4}I", payload)
 
 
 def unpack_read_memory(payload: bytes) -> tuple[int, int]:
     """Address and count (bytes) of READMEM; Nack when it asks for too much or off the 4-byte grid."""
     if len(payload) != 8:
-        raise Nack(Status.BAD_PARAMETER, f"READMEM of {len(payload)} bytes")
+        raise Nack(GvcpStatus.BAD_PARAMETER, f"READMEM of {len(payload)} bytes")
     address, _, count = struct.unpack(">IHH", payload)
     if count == 0 or count > READ_LIMIT_bytes:
-        raise Nack(Status.BAD_PARAMETER, f"READMEM asks for {count} bytes")
+        raise Nack(GvcpStatus.BAD_PARAMETER, f"READMEM asks for {count} bytes")
     if address % 4 or count % 4:
-        raise Nack(Status.BAD_ALIGNMENT, f"READMEM of {count} bytes at {address:#x}")
+        raise Nack(GvcpStatus.BAD_ALIGNMENT, f"READMEM of {count} bytes at {address:#x}")
     return address, count
 
 
@@ -147,10 +147,10 @@ def pack_write_memory(address: int, data: bytes) -> bytes:
 def unpack_write_memory(payload: bytes) -> tuple[int, bytes]:
     """Address and data of WRITEMEM; Nack when empty or off the 4-byte grid."""
     if len(payload) <= 4:
-        raise Nack(Status.BAD_PARAMETER, f"WRITEMEM of {len(payload)} bytes")
+        raise Nack(GvcpStatus.BAD_PARAMETER, f"WRITEMEM of {len(payload)} bytes")
     address, data = int.from_bytes(payload[:4], "big"), payload[4:]
     if address % 4 or len(data) % 4:
-        raise Nack(Status.BAD_ALIGNMENT, f"WRITEMEM of {len(data)} bytes at {address:#x}")
+        raise Nack(GvcpStatus.BAD_ALIGNMENT, f"WRITEMEM of {len(data)} bytes at {address:#x}")
     return address, data
 
 
@@ -168,20 +168,22 @@ class Resend:
     last: int
     extended: bool = False
 
-    def request(self, req_id: int) -> Request:
+    def request(self, req_id: int) -> GvcpRequest:
         """The command; it is not acknowledged."""
         if self.extended:
             payload = _RESEND_EXTENDED.pack(0, 0, self.first, self.last, self.block_id)
-            return Request(Command.PACKETRESEND, req_id, payload, flags=EXTENDED_IDS)
-        return Request(Command.PACKETRESEND, req_id, _RESEND.pack(0, self.block_id, self.first, self.last), flags=0)
+            return GvcpRequest(GvcpCommand.PACKETRESEND, req_id, payload, flags=EXTENDED_IDS)
+        return GvcpRequest(
+            GvcpCommand.PACKETRESEND, req_id, _RESEND.pack(0, self.block_id, self.first, self.last), flags=0
+        )
 
 
-def unpack_resend(request: Request) -> Resend:
+def unpack_resend(request: GvcpRequest) -> Resend:
     """What a PACKETRESEND asks for; Nack when it is too short."""
     extended = bool(request.flags & EXTENDED_IDS)
     layout = _RESEND_EXTENDED if extended else _RESEND
     if len(request.payload) < layout.size:
-        raise Nack(Status.BAD_PARAMETER, f"PACKETRESEND of {len(request.payload)} bytes")
+        raise Nack(GvcpStatus.BAD_PARAMETER, f"PACKETRESEND of {len(request.payload)} bytes")
     if extended:
         _, _, first, last, block_id = layout.unpack_from(request.payload)
         return Resend(block_id, first, last, extended=True)

@@ -11,6 +11,9 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
 OK = 0x0000
 RESENT = 0x0100
 UNAVAILABLE = 0x800C
@@ -25,7 +28,7 @@ _TRAILER = struct.Struct(">HHI")
 _IMAGE = 1
 
 
-class Kind(IntEnum):
+class PacketKind(IntEnum):
     """What a packet carries."""
 
     LEADER = 1
@@ -63,7 +66,7 @@ class Malformed(ValueError):
 class Packet:
     """One packet as received; `data` is what follows the header."""
 
-    kind: Kind
+    kind: PacketKind
     block_id: int
     packet_id: int
     data: bytes = b""
@@ -80,7 +83,7 @@ def header_size(extended: bool) -> int:
     return _EXTENDED.size if extended else _SHORT.size
 
 
-def header(kind: Kind, block_id: int, packet_id: int, status: int, extended: bool) -> bytes:
+def header(kind: PacketKind, block_id: int, packet_id: int, status: int, extended: bool) -> bytes:
     """The header of one packet."""
     if extended:
         return _EXTENDED.pack(status, 0, (_EXTENDED_BIT | kind) << 24, block_id, packet_id)
@@ -99,9 +102,9 @@ def decode(datagram: bytes) -> Packet:
             raise Malformed(f"{len(datagram)} bytes are no extended GVSP header")
         status, _, word, block_id, packet_id = _EXTENDED.unpack_from(datagram)
     kind = word >> 24 & ~_EXTENDED_BIT
-    if kind not in (Kind.LEADER, Kind.TRAILER, Kind.PAYLOAD):
+    if kind not in (PacketKind.LEADER, PacketKind.TRAILER, PacketKind.PAYLOAD):
         raise Malformed(f"packet of kind {kind}")
-    return Packet(Kind(kind), block_id, packet_id, datagram[header_size(extended) :], status, extended)
+    return Packet(PacketKind(kind), block_id, packet_id, datagram[header_size(extended) :], status, extended)
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ class Leader:
 
 
 @dataclass(frozen=True)
-class Block:
+class ImageBlock:
     """One image cut into packets of `packet_size` bytes (IP and UDP header included), on demand.
 
     `pixels` are the bytes of the image, rows from the top; they must not change while the block lives.
@@ -150,10 +153,51 @@ class Block:
         if not 0 <= packet_id <= self.trailer_id:
             raise IndexError(f"packet {packet_id} of {self.trailer_id + 1}")
         if packet_id == 0:
-            kind, data = Kind.LEADER, self.leader.encode()
+            kind, data = PacketKind.LEADER, self.leader.encode()
         elif packet_id == self.trailer_id:
-            kind, data = Kind.TRAILER, _TRAILER.pack(0, _IMAGE, self.leader.height)
+            kind, data = PacketKind.TRAILER, _TRAILER.pack(0, _IMAGE, self.leader.height)
         else:
             begin = (packet_id - 1) * self.data_size
-            kind, data = Kind.PAYLOAD, self.pixels[begin : begin + self.data_size]
+            kind, data = PacketKind.PAYLOAD, self.pixels[begin : begin + self.data_size]
         return header(kind, self.block_id, packet_id, status, self.extended), data
+
+
+# Pixels as a camera sends them: 8 bits of the scene in any of its formats (GigE Vision 1.2, section 27; PFNC 2.1).
+
+
+_BITS = {PixelFormat.MONO10: 10, PixelFormat.MONO12: 12, PixelFormat.MONO16: 16}
+_IN_THREE_BYTES = {PixelFormat.MONO10PACKED: 10, PixelFormat.MONO12PACKED: 12}
+_GAPLESS = {PixelFormat.MONO10P: 10, PixelFormat.MONO12P: 12}
+
+
+def encoded(image: NDArray[np.uint8], pixel_format: PixelFormat) -> bytes:
+    """The bytes of an image, its 8 bits as the upper ones of each pixel."""
+    if pixel_format in _BITS:
+        return (image.astype("<u2") << _BITS[pixel_format] - 8).astype("<u2").tobytes()
+    if pixel_format in _IN_THREE_BYTES:
+        bits = _IN_THREE_BYTES[pixel_format]
+        return _in_three_bytes((image.reshape(-1).astype(np.uint16) << bits - 8).astype(np.uint16), bits)
+    if pixel_format in _GAPLESS:
+        bits = _GAPLESS[pixel_format]
+        values = image.reshape(-1, 1).astype(np.uint16) << bits - 8
+        return np.packbits(values >> np.arange(bits, dtype=np.uint16) & 1, bitorder="little").tobytes()
+    return image.tobytes()
+
+
+def _in_three_bytes(values: NDArray[np.uint16], bits: int) -> bytes:
+    """Two pixels in three bytes: upper 8 bits, both lower parts (the first's in the lower half), upper 8 bits."""
+    low = bits - 8
+    pairs = np.append(values, np.zeros(len(values) % 2, np.uint16)).reshape(-1, 2)
+    shared = (pairs[:, 0] & (1 << low) - 1) | (pairs[:, 1] & (1 << low) - 1) << 4
+    packed = np.stack([pairs[:, 0] >> low, shared, pairs[:, 1] >> low], axis=1).astype(np.uint8).tobytes()
+    return packed[: -(-len(values) * 12 // 8)]
+
+
+def binned(image: NDArray[np.uint8], across: int, down: int) -> NDArray[np.uint8]:
+    """The mean of so many pixels across and down in the place of each; what does not fill one at the edges is left
+    out."""
+    if across == down == 1:
+        return image
+    height, width = image.shape[0] // down, image.shape[1] // across
+    parts = image[: height * down, : width * across].reshape(height, down, width, across)
+    return parts.mean(axis=(1, 3)).round().astype(np.uint8)

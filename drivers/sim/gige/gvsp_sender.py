@@ -13,14 +13,45 @@ from typing import Literal
 
 from thermostand.drivers.sim.gige import gvsp
 from thermostand.drivers.sim.gige.gvcp import Resend
-from thermostand.drivers.sim.gige.gvsp import Block
-from thermostand.drivers.sim.gige.switch import Switch
+from thermostand.drivers.sim.gige.gvsp import ImageBlock
 
 Destination = tuple[str, int]
 
 KEPT_BLOCKS = 4
 _BURST_bytes = 32_768  # sent without a pause: well below the smallest receive buffer in use (212,992 bytes)
 _CATCH_UP_s = 0.002  # a stalled sender makes up for no more than this, or it would flood the receiver
+
+
+# The switch between several cameras and the computer: one line out, a buffer in front of it, and what does not fit is
+# lost, as in a real one.
+
+
+BUFFER_bytes = 256_000  # a small one's, for all its ports
+_OVERHEAD_bytes = 66  # Ethernet with preamble and gap, IP, UDP
+
+
+class Switch:
+    """rate_MBps: of the line out, 1e6 bytes/s. lost: packets that found no room."""
+
+    def __init__(self, rate_MBps: float, buffer_bytes: int = BUFFER_bytes) -> None:
+        self.lost = 0
+        self._rate_Bps = rate_MBps * 1e6
+        self._buffer_bytes = buffer_bytes
+        self._held_bytes = 0.0
+        self._at_s = 0.0
+        self._lock = threading.Lock()  # each camera sends in a thread of its own
+
+    def passes(self, size_bytes: int, now_s: float | None = None) -> bool:
+        """Whether a packet of so many bytes of payload, which comes now, gets through."""
+        with self._lock:
+            now_s = time.monotonic() if now_s is None else now_s
+            left_bytes = self._held_bytes - (now_s - self._at_s) * self._rate_Bps
+            self._held_bytes, self._at_s = max(0.0, left_bytes), now_s
+            if self._held_bytes + size_bytes > self._buffer_bytes:
+                self.lost += 1
+                return False
+            self._held_bytes += size_bytes + _OVERHEAD_bytes
+            return True
 
 
 @dataclass
@@ -82,7 +113,7 @@ class StreamCounts:
 class _Job:
     """One packet to send."""
 
-    block: Block
+    block: ImageBlock
     packet_id: int
     destination: Destination
     status: int = gvsp.OK
@@ -143,7 +174,7 @@ class StreamSender:
         self._wake = threading.Condition()
         self._closed = threading.Event()
         self._queue = _Queue()
-        self._kept: deque[tuple[Block, Destination]] = deque(maxlen=KEPT_BLOCKS)
+        self._kept: deque[tuple[ImageBlock, Destination]] = deque(maxlen=KEPT_BLOCKS)
         self.counts = StreamCounts()
         self._thread = threading.Thread(target=self._run, name="gvsp sender", daemon=True)
 
@@ -160,7 +191,7 @@ class StreamSender:
         if self._thread.is_alive():
             self._thread.join()
 
-    def begin(self, block: Block, destination: Destination, gap_s: float = 0.0) -> threading.Event:
+    def begin(self, block: ImageBlock, destination: Destination, gap_s: float = 0.0) -> threading.Event:
         """Begin to send one block; the event is set when its last packet has left, or it was abandoned.
 
         `gap_s` is the pause that the client asked for between two packets (GevSCPD).
@@ -197,14 +228,14 @@ class StreamSender:
             self._queue = _Queue()
             self._kept.clear()
 
-    def _jobs(self, block: Block, destination: Destination) -> Iterator[_Job]:
+    def _jobs(self, block: ImageBlock, destination: Destination) -> Iterator[_Job]:
         skipped = {0} if self._faults.drop_leader else set[int]()
         if self._faults.drop_trailer:
             skipped.add(block.trailer_id)
         packet_ids = (packet_id for packet_id in range(block.trailer_id + 1) if packet_id not in skipped)
         return (_Job(block, packet_id, destination) for packet_id in packet_ids)
 
-    def _repeat(self, block: Block, destination: Destination, resend: Resend) -> None:
+    def _repeat(self, block: ImageBlock, destination: Destination, resend: Resend) -> None:
         is_sent = self._queue.jobs is None or block is not self._kept[-1][0] or self._left >= block.trailer_id - 1
         last = block.trailer_id if is_sent else self._left
         for packet_id in range(resend.first, min(resend.last, last) + 1):
@@ -215,7 +246,7 @@ class StreamSender:
         if not self._kept:  # nobody waits
             return
         _, destination = self._kept[-1]
-        kind = gvsp.Kind.PAYLOAD
+        kind = gvsp.PacketKind.PAYLOAD
         header = gvsp.header(kind, resend.block_id, resend.first, gvsp.UNAVAILABLE, resend.extended)
         self._queue.refusals.append((header, destination))
 

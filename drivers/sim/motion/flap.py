@@ -9,15 +9,13 @@ import struct
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from thermostand.drivers.sim.fakes import FLAP, Bench, fake
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.usb import Stall, TimedOut, UsbServer
 from thermostand.foundation.addresses import tcp_place
 from thermostand.foundation.clock import NS_PER_S, Now
-
-if TYPE_CHECKING:
-    from thermostand.drivers.sim.physics.plant import Plant
 
 VENDOR_ID, PRODUCT_ID_21V3 = 0x1FFB, 0x00C5
 FULL_SCALE = 4095
@@ -61,7 +59,7 @@ VARIABLES = struct.Struct("<HHHHhhhBBHHHBHH4xBI13xhBB")
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class FlapDrive:
     """The motor driven from `position` towards `wanted` since `start_ns`, as far as `reachable`, at `speed` units/s."""
 
     start_ns: int
@@ -110,8 +108,8 @@ class FakeFlap:
         self._jam: float | None = None
         self._lowest, self._highest = 0.0, float(FULL_SCALE)
         self._eeprom = _delivered()
-        standing = Drive(clock.now_ns(), closed_position, closed_position, closed_position, 0.0)
-        self._drives: deque[Drive] = deque([standing], maxlen=16)
+        standing = FlapDrive(clock.now_ns(), closed_position, closed_position, closed_position, 0.0)
+        self._drives: deque[FlapDrive] = deque([standing], maxlen=16)
         self.restart(reset_cause=0)
         plant.flap_open_at = self.open_at
 
@@ -179,8 +177,7 @@ class FakeFlap:
     ) -> bytes:
         """One transfer at the clock's present time: what was read, or b"" for a write; raises
         drivers.sim.usb.TransferFailed."""
-        with self._plant.lock:
-            self._plant.advance(self._clock.now_ns())
+        with self._plant.at(self._clock):
             if self.timeout:
                 raise TimedOut
             if self.stall:
@@ -278,7 +275,7 @@ class FakeFlap:
                 wanted = self._target
             duty = min(FULL_DUTY, self._setting(MAX_DUTY_FORWARD if wanted > position else MAX_DUTY_REVERSE))
         reachable = min(max(wanted, self._lowest), self._highest) if duty else position
-        self._drives.append(Drive(now_ns, position, wanted, reachable, TRAVEL_PER_S * duty / FULL_DUTY))
+        self._drives.append(FlapDrive(now_ns, position, wanted, reachable, TRAVEL_PER_S * duty / FULL_DUTY))
 
     def _variables(self) -> bytes:
         now_ns = self._clock.now_ns()

@@ -19,7 +19,7 @@ class Pace:
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class MotionPhase:
     """A stretch of constant acceleration within which the speed keeps its sign."""
 
     duration_s: float
@@ -44,7 +44,7 @@ class Phase:
 class Path:
     """Phases in a row, then rest at `end`; `end` is NaN when the last phase never ends."""
 
-    phases: tuple[Phase, ...]
+    phases: tuple[MotionPhase, ...]
     end: float
 
     @property
@@ -65,7 +65,7 @@ class Path:
         for index, phase in enumerate(self.phases):
             if elapsed_s < phase.duration_s:
                 position, speed = phase.at(elapsed_s)
-                rest = Phase(phase.duration_s - elapsed_s, position, speed, phase.accel)
+                rest = MotionPhase(phase.duration_s - elapsed_s, position, speed, phase.accel)
                 return Path((rest, *self.phases[index + 1 :]), self.end)
             elapsed_s -= phase.duration_s
         return Path((), self.end)
@@ -133,12 +133,12 @@ def path_to_halt(position: float, speed: float, decel: float) -> Path:
     return Path(_phases(position, speed, [(abs(speed) / decel, -math.copysign(decel, speed))]), end)
 
 
-def _phases(position: float, speed: float, stretches: list[tuple[float, float]]) -> tuple[Phase, ...]:
+def _phases(position: float, speed: float, stretches: list[tuple[float, float]]) -> tuple[MotionPhase, ...]:
     """Stretches (duration_s, acceleration) laid end to end, empty ones left out."""
-    phases: list[Phase] = []
+    phases: list[MotionPhase] = []
     for duration_s, accel in stretches:
         if duration_s > 0:
-            phases.append(Phase(duration_s, position, speed, accel))
+            phases.append(MotionPhase(duration_s, position, speed, accel))
             if duration_s < math.inf:
                 position, speed = phases[-1].at(duration_s)
     return tuple(phases)
@@ -148,7 +148,7 @@ def _joined(first: Path, second: Path) -> Path:
     return Path(first.phases + second.phases, second.end)
 
 
-def _crossing_s(phase: Phase, level: float, direction: int) -> float:
+def _crossing_s(phase: MotionPhase, level: float, direction: int) -> float:
     """Time within a phase moving in `direction` until it is at or beyond `level`; inf when the phase turns first."""
     distance = direction * (level - phase.position)
     if distance <= 0:

@@ -20,7 +20,7 @@ HISTORY = 16  # travels kept, so that a picture exposed a moment ago is rendered
 
 
 @dataclass(frozen=True, slots=True)
-class Switches:
+class LimitSwitches:
     """Mechanical positions at which the limit switches close, in steps; None where there is none.
 
     With `turn_steps` the stage is a turntable: the left switch closes once a turn, within `width_steps` of its place.
@@ -66,7 +66,7 @@ class Shift:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class Onward:
     """Move in a direction for ever; with `to_switch` until the limit switch of that side, which is then no failure."""
 
     direction: int
@@ -81,7 +81,7 @@ class Brake:
     decel: float
 
 
-Leg = GoTo | Shift | Run | Brake
+Leg = GoTo | Shift | Onward | Brake
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class Stops:
 
 
 @dataclass(frozen=True, slots=True)
-class Travel:
+class Journey:
     """One leg under way, or rest. `slip` is mechanics minus count when it began; `limit` is the side that ended it
     against its will; `energised`: the windings have not been switched off; `rest_ns`: since when a rest lasts."""
 
@@ -113,7 +113,7 @@ class Travel:
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
+class LegEnd:
     """When and at which count a leg ends, and the side of the limit that ends it against its will (0: it ends well)."""
 
     time_ns: int
@@ -128,13 +128,13 @@ class Stepper:
     or RIGHT, a switch that reads closed wherever the stage is.
     """
 
-    def __init__(self, switches: Switches, mechanical: float, time_ns: int) -> None:
+    def __init__(self, switches: LimitSwitches, mechanical: float, time_ns: int) -> None:
         self.switches = switches
         self.stops = Stops()
         self.stall_at: float | None = None
         self.stuck_switch = 0
-        resting = Travel(time_ns, rest(0.0), mechanical, energised=False, rest_ns=time_ns)
-        self._travels: deque[Travel] = deque([resting], maxlen=HISTORY)
+        resting = Journey(time_ns, rest(0.0), mechanical, energised=False, rest_ns=time_ns)
+        self._travels: deque[Journey] = deque([resting], maxlen=HISTORY)
 
     def go(self, time_ns: int, *legs: Leg) -> None:
         """Leave what was under way and do `legs` one after the other, from the present position and speed."""
@@ -169,7 +169,7 @@ class Stepper:
         slip = self._slip(travel, time_ns) - by
         self._travels.append(replace(travel, start_ns=time_ns, path=Path(phases, travel.path.end + by), slip=slip))
 
-    def travel(self, time_ns: int) -> Travel:
+    def travel(self, time_ns: int) -> Journey:
         """The leg of that time, begun and ended events included. Times before the history give its first entry."""
         travel = next((past for past in reversed(self._travels) if past.start_ns <= time_ns), self._travels[0])
         while (ending := self._ending(travel)) is not None and ending.time_ns <= time_ns:
@@ -197,40 +197,40 @@ class Stepper:
         """LEFT, RIGHT or 0."""
         return self.stuck_switch or self.switches.closed(self.mechanical(time_ns))
 
-    def _slip(self, travel: Travel, time_ns: int) -> float:
+    def _slip(self, travel: Journey, time_ns: int) -> float:
         return self._slip_past(travel, travel.path.highest(travel.elapsed_s(time_ns)))
 
-    def _slip_past(self, travel: Travel, highest: float) -> float:
+    def _slip_past(self, travel: Journey, highest: float) -> float:
         """Slip once the count has been to `highest`: the mechanics waits at the obstacle, and turns back with it."""
         if self.stall_at is None:
             return travel.slip
         return min(travel.slip, self._ceiling(travel, self.stall_at) - highest)
 
-    def _ceiling(self, travel: Travel, stall_at: float) -> float:
+    def _ceiling(self, travel: Journey, stall_at: float) -> float:
         """An obstacle behind the stage does not pull it back."""
         return max(stall_at, travel.path.at(0.0)[0] + travel.slip)
 
-    def _halted(self, travel: Travel, time_ns: int) -> Travel:
+    def _halted(self, travel: Journey, time_ns: int) -> Journey:
         path = rest(travel.path.at(travel.elapsed_s(time_ns))[0])
         rest_ns = time_ns if travel.leg else travel.rest_ns
-        return Travel(time_ns, path, self._slip(travel, time_ns), energised=travel.energised, rest_ns=rest_ns)
+        return Journey(time_ns, path, self._slip(travel, time_ns), energised=travel.energised, rest_ns=rest_ns)
 
-    def _ending(self, travel: Travel) -> Ending | None:
+    def _ending(self, travel: Journey) -> LegEnd | None:
         """How the leg under way will end, None when there is none or it never does."""
         if travel.leg is None:
             return None
         endings = [(travel.path.duration_s, travel.path.end, 0)]
         for direction in (LEFT, RIGHT):
-            wanted = isinstance(travel.leg, Run) and travel.leg.to_switch and travel.leg.direction == direction
+            wanted = isinstance(travel.leg, Onward) and travel.leg.to_switch and travel.leg.direction == direction
             count = self._stop_count(travel, direction, wanted)
             reached_s = travel.path.reaches_s(count, direction)
             if reached_s is not None:
                 count = count if reached_s > 0 else travel.path.at(0.0)[0]
                 endings.append((reached_s, count, 0 if wanted else direction))
         ends_s, count, limit = min(endings)
-        return None if ends_s == math.inf else Ending(travel.start_ns + seconds_ns(ends_s), count, limit)
+        return None if ends_s == math.inf else LegEnd(travel.start_ns + seconds_ns(ends_s), count, limit)
 
-    def _stop_count(self, travel: Travel, direction: int, wanted: bool) -> float:
+    def _stop_count(self, travel: Journey, direction: int, wanted: bool) -> float:
         """The count at which motion in `direction` will end, infinite when nothing stops it."""
         stop = self.stops.left if direction == LEFT else self.stops.right
         if stop is not None and not wanted:
@@ -245,11 +245,11 @@ class Stepper:
         return place - self._slip_past(travel, turning)
 
 
-def _begun(time_ns: int, count: float, speed: float, slip: float, legs: tuple[Leg, ...]) -> Travel:
+def _begun(time_ns: int, count: float, speed: float, slip: float, legs: tuple[Leg, ...]) -> Journey:
     """The first of `legs`, from `count` and `speed`; at rest when there is none."""
     if not legs:
-        return Travel(time_ns, rest(count), slip, rest_ns=time_ns)
-    return Travel(time_ns, _path(legs[0], count, speed), slip, legs[0], legs[1:])
+        return Journey(time_ns, rest(count), slip, rest_ns=time_ns)
+    return Journey(time_ns, _path(legs[0], count, speed), slip, legs[0], legs[1:])
 
 
 def _path(leg: Leg, position: float, speed: float) -> Path:
@@ -258,7 +258,7 @@ def _path(leg: Leg, position: float, speed: float) -> Path:
             return path_to(position, speed, target, pace)
         case Shift(steps, pace):
             return path_to(position, speed, position + steps, pace)
-        case Run(direction, pace):
+        case Onward(direction, pace):
             return path_onward(position, speed, direction, pace)
         case Brake(decel):
             return path_to_halt(position, speed, decel)

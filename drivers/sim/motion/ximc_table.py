@@ -10,7 +10,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from thermostand.drivers.sim.motion.stepper import Switches
+from thermostand.drivers.sim.motion.stepper import LimitSwitches
 
 # Commands that only act; the request carries this payload and the reply is the bare letters.
 ACTIONS: Mapping[str, str] = dict.fromkeys(
@@ -120,7 +120,7 @@ class Profile:
 
     name: str
     unit_per_step: float
-    switches: Switches
+    switches: LimitSwitches
     settings: Mapping[str, tuple[int | bytes | float, ...]]
 
 
@@ -129,7 +129,7 @@ SECURITY = (800, 4_000, 5_500, 800, 450, 520, 420, 0x9D)
 LINEAR_8MT160_300 = Profile(
     name="8MT160-300",
     unit_per_step=0.0025,
-    switches=Switches(left=-500, right=119_500),
+    switches=LimitSwitches(left=-500, right=119_500),
     settings={
         "mov": (1_000, 0, 2_000, 4_000, 1_000, 0, 0),
         "eng": (1, 1_200, 3_200, 0, 0x91, 575, 9, 200),
@@ -150,7 +150,7 @@ LINEAR_8MT160_300 = Profile(
 ROTARY_8MR151 = Profile(
     name="8MR151",
     unit_per_step=0.01,
-    switches=Switches(left=1_250, right=None, turn_steps=36_000),
+    switches=LimitSwitches(left=1_250, right=None, turn_steps=36_000),
     settings={
         "mov": (2_000, 0, 2_000, 5_000, 2_000, 0, 0),
         "eng": (360, 670, 5_000, 0, 0x90, 1_800, 9, 200),

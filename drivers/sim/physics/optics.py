@@ -48,7 +48,7 @@ class Nodes:
 
 
 @dataclass(frozen=True)
-class Placement:
+class StandPlacement:
     """Where the stand puts camera and target.
 
     linear_mm moves the target away from the camera. rotary_deg turns it about the vertical through its centre, the
@@ -86,7 +86,7 @@ class Optics:
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraDeformation:
     """What heat does to one camera: pixel-free displacements of its parts.
 
     sensor_mm: sensor against the lens axis (x, y); stretch: relative change of the image distance; tilt and turn as in
@@ -120,7 +120,7 @@ def pad_sag_mm(temperature_degC: float) -> float:
     return 1.2e-3 / (1.0 - softening)
 
 
-def modified_camera(nodes: Nodes) -> Camera:
+def modified_camera(nodes: Nodes) -> CameraDeformation:
     """Sensor between granite columns, lens on granite prisms, no link between them (paper, section 4)."""
     carrier_mm = 11.2 * strain(nodes.sensor_degC, ALUMINIUM_per_K, 1000.0)  # the sensor slides up between its columns
     barrel_mm = 4.6 * strain(nodes.lens_degC, ALUMINIUM_per_K, 320.0)  # the barrel lifts the axis off the prisms
@@ -131,7 +131,7 @@ def modified_camera(nodes: Nodes) -> Camera:
     lens = strain(nodes.lens_degC, 4.5e-6, 800.0)
     sensor_warming_K = nodes.sensor_degC - REFERENCE_degC
     bow_rad = -1.8e-6 * (nodes.granite_inside_degC - nodes.granite_outside_degC)
-    return Camera(
+    return CameraDeformation(
         sensor_mm=(column_mm - prism_mm, carrier_mm - barrel_mm - sag_mm),
         stretch=spacing + lens,
         k1=-0.12 + 1.0e-5 * (nodes.lens_degC - REFERENCE_degC),
@@ -140,14 +140,14 @@ def modified_camera(nodes: Nodes) -> Camera:
     )
 
 
-def unmodified_camera(nodes: Nodes, camera_roll_rad: float) -> Camera:
+def unmodified_camera(nodes: Nodes, camera_roll_rad: float) -> CameraDeformation:
     """Sensor screwed to the housing, lens in a C-mount: larger, dependent on orientation, and it does not come back."""
     housing_mm = 14.0 * strain(nodes.body_degC, ALUMINIUM_per_K, 320.0)
     board_mm = 4.0 * strain(nodes.sensor_degC, 16.0e-6, 1100.0)
     mount_K = nodes.body_degC - nodes.lens_degC  # a gradient across the mount bends it
     droop_mm = 0.9e-4 * (nodes.body_degC - REFERENCE_degC)  # the mount yields to the lens's weight as it warms
     slack_K, grip_K = nodes.tensions_K if nodes.tensions_K else (0.0, 0.0)
-    return Camera(
+    return CameraDeformation(
         sensor_mm=(
             0.28 * housing_mm + 5.0e-5 * slack_K + 4.0e-5 * grip_K + droop_mm * math.sin(camera_roll_rad),
             0.30 * housing_mm + board_mm + 11.0e-5 * slack_K + 8.0e-5 * grip_K + droop_mm * math.cos(camera_roll_rad),
@@ -159,14 +159,14 @@ def unmodified_camera(nodes: Nodes, camera_roll_rad: float) -> Camera:
     )
 
 
-def optics_at(kind: CameraKind, nodes: Nodes, placement: Placement) -> Optics:
+def optics_at(kind: CameraKind, nodes: Nodes, placement: StandPlacement) -> Optics:
     """The camera and the target's pose for these temperatures and this placement."""
     roll_rad = math.radians(placement.camera_roll_deg)
     camera = modified_camera(nodes) if kind == "modified" else unmodified_camera(nodes, roll_rad)
     return optics_of(camera, nodes, placement)
 
 
-def optics_of(camera: Camera, nodes: Nodes, placement: Placement) -> Optics:
+def optics_of(camera: CameraDeformation, nodes: Nodes, placement: StandPlacement) -> Optics:
     """This camera before the target, with the stand's temperatures (those of `nodes` that are not the camera's)."""
     roll_rad = math.radians(placement.camera_roll_deg)
     inside = strain(nodes.granite_inside_degC, GRANITE_per_K, 900.0)

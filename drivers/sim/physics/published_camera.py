@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.drivers.camera_preset import Bounds, CameraPreset, Effect
-from thermostand.drivers.sim.physics.optics import Camera, PITCH_mm, REFERENCE_degC
+from thermostand.drivers.sim.physics.optics import CameraDeformation, PITCH_mm, REFERENCE_degC
 from thermostand.drivers.sim.physics.wear import Fixings, Lag, Play, StickSlip
 
 CHIP, BODY, CELL, GLASS, MOUNT = range(5)
@@ -131,7 +131,7 @@ class PublishedCamera:
             return None
         return REFERENCE_degC + self._far_share * (self._far.value - REFERENCE_degC)
 
-    def optics(self, camera_roll_rad: float) -> Camera:
+    def optics(self, camera_roll_rad: float) -> CameraDeformation:
         """Its parts' places now."""
         away_K = (self._degC - REFERENCE_degC).tolist()
         bent_K = [each * (1 + self._bend_per_K * each) for each in away_K]
@@ -140,7 +140,7 @@ class PublishedCamera:
         moved = [_scaled(self._body_px_per_K, bent_K[BODY]), _scaled(self._cell_px_per_K, bent_K[CELL])]
         moved += self._beyond(camera_roll_rad, away_K)
         lean_K = away_K[BODY] - away_K[CELL]
-        return Camera(
+        return CameraDeformation(
             sensor_mm=(PITCH_mm * sum(each[0] for each in moved), PITCH_mm * sum(each[1] for each in moved)),
             stretch=stretch,
             k1=_K1 + self._radial_per_K * away_K[GLASS],

@@ -15,9 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.drivers.sim.physics.optics import HEIGHT_px, Optics, WIDTH_px, outlines_px, true_centres_px
-
-__all__ = ["Scene", "SceneSpec", "true_centres_px"]
+from thermostand.drivers.sim.physics.optics import HEIGHT_px, Optics, WIDTH_px, outlines_px
 
 SUBCELLS = 4  # cells per pixel and axis
 BLUR_REACH = 6.0  # the Gaussian is followed this many sigma outwards
@@ -47,7 +45,7 @@ class SceneSpec:
     read_noise_DN: float = 1.0
 
 
-class Scene:
+class SimulatedScene:
     """Renders the target; holds only what the spec fixes, so frames do not depend on each other."""
 
     def __init__(self, spec: SceneSpec, seed: int) -> None:

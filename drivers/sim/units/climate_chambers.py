@@ -1,4 +1,5 @@
-"""Commercial climate chambers, each on its wire, with the plant behind it: ESPEC P300, CTS, Weiss/Voetsch (ASCII-2).
+"""Commercial climate chambers, each on its wire, with the plant behind it: ESPEC P300, CTS, Weiss/Voetsch (ASCII-2 and
+SIMSERV), Julabo.
 
 Sources: ESPEC P300/SCP-220 and CTS interface manuals, Voetsch ASCII-2 transcripts. Each answers text; how it is framed
 is said at its class. The control is proportional over 3 K. None has a watchdog of its communications.
@@ -7,24 +8,17 @@ is said at its class. The control is proportional over 3 K. None has a watchdog 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from functools import reduce
+from operator import xor
+from typing import Any
 
 from thermostand.drivers.sim.fakes import CONTROL, Bench, fake
-from thermostand.drivers.sim.units.modbus import Timeline
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.foundation.clock import NS_PER_S, Now
 
 PROPORTIONAL_BAND_K = 3.0
-
-
-class Chamber(Timeline, Protocol):
-    """What a chamber sees and moves of the plant."""
-
-    heater_on_fraction: float
-    heater_enabled: bool
-    compressor_on: bool
-    chamber_degC: float
 
 
 class FakeClimateChamber:
@@ -34,7 +28,9 @@ class FakeClimateChamber:
     runs, and goes there). `press_setpoint`, `press_stop`: at the panel. is_alone: no relay in series enables its heat.
     """
 
-    def __init__(self, plant: Chamber, clock: Now) -> None:
+    line_end = b"\r"
+
+    def __init__(self, plant: Plant, clock: Now) -> None:
         self.setpoint_degC = 23.0
         self.limits_degC = (-40.0, 150.0)
         self.running = False
@@ -55,6 +51,14 @@ class FakeClimateChamber:
 
     def engine(self) -> Conversation:
         """A new conversation with it."""
+        return Conversation(self, self._take)
+
+    def _take(self, buffer: bytes) -> tuple[bytes, bytes] | None:
+        """The reply to the first line, and what follows it; None while it is not whole."""
+        line, separator, rest = buffer.partition(self.line_end)
+        return (self._reply(line), rest) if separator else None
+
+    def _reply(self, line: bytes) -> bytes:
         raise NotImplementedError
 
     def press_setpoint(self, setpoint_degC: float) -> None:
@@ -80,12 +84,9 @@ class FakeClimateChamber:
         """What it shows."""
         return self._plant.chamber_degC if self.stuck_degC is None else self.stuck_degC
 
-    @contextmanager
-    def now(self) -> Generator[None]:
+    def now(self) -> AbstractContextManager[int]:
         """Its state at the clock's present time."""
-        with self._plant.lock:
-            self._plant.advance(self._clock.now_ns())
-            yield
+        return self._plant.at(self._clock)
 
     def set(self, degC: float) -> bool:
         """A set-point from the wire; whether it is taken."""
@@ -137,17 +138,10 @@ class FakeEspec(FakeClimateChamber):
     own."""
 
     mode = ""
+    line_end = b"\n"
 
-    def engine(self) -> Conversation:
-        """Lines."""
-
-        def take(buffer: bytes) -> tuple[bytes, bytes] | None:
-            line, separator, rest = buffer.partition(b"\n")
-            if not separator:
-                return None
-            return self._answer(line.decode("latin-1").strip()).encode("latin-1") + b"\r\n", rest
-
-        return Conversation(self, take)
+    def _reply(self, line: bytes) -> bytes:
+        return self._answer(line.decode("latin-1").strip()).encode("latin-1") + b"\r\n"
 
     def _answer(self, command: str) -> str:
         low_degC, high_degC = self.limits_degC
@@ -196,15 +190,14 @@ class FakeCts(FakeClimateChamber):
 
     paused = ramps = False
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int = 1, *, is_serial: bool = False) -> None:
+    def __init__(self, plant: Plant, clock: Now, unit: int = 1, *, is_serial: bool = False) -> None:
         super().__init__(plant, clock)
         self.unit = unit
         self.answers_as = unit
         self._is_serial = is_serial
 
-    def engine(self) -> Conversation:
-        """Frames, or bare texts."""
-        return Conversation(self, self._take_frame if self._is_serial else self._take_text)
+    def _take(self, buffer: bytes) -> tuple[bytes, bytes] | None:
+        return self._take_frame(buffer) if self._is_serial else self._take_text(buffer)
 
     def _take_text(self, buffer: bytes) -> tuple[bytes, bytes] | None:
         found = re.match(rb"a0 -?\d+\.\d|s[123] [01]|[A-Z][0-9:;<]?", buffer)
@@ -218,19 +211,13 @@ class FakeCts(FakeClimateChamber):
             return None
         body, rest = buffer[begin + 1 : end], buffer[end + 1 :]
         text = bytes(byte & 0x7F for byte in body[1:-1])
-        check = 0
-        for byte in body[:-1]:
-            check ^= byte
-        if body[0] != 0x80 + self.unit or body[-1] != check | 0x80:
+        if body[0] != 0x80 + self.unit or body[-1] != reduce(xor, body[:-1], 0) | 0x80:
             return b"", rest
         reply = self._answer(text.decode("latin-1"))
         if not reply:
             return b"", rest
         high = bytes([0x80 + self.answers_as, *(ord(character) | 0x80 for character in reply)])
-        check = 0
-        for byte in high:
-            check ^= byte
-        return b"\x02" + high + bytes([check | 0x80]) + b"\x03", rest
+        return b"\x02" + high + bytes([reduce(xor, high) | 0x80]) + b"\x03", rest
 
     def _answer(self, command: str) -> str:
         match command[:2]:
@@ -265,22 +252,13 @@ class FakeWeiss(FakeClimateChamber):
     by 0, or by nothing when it is `mute`; one that is ignored is answered in the same way. ramp_K_per_min: the nominal
     value in the reply moves."""
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int = 1) -> None:
+    def __init__(self, plant: Plant, clock: Now, unit: int = 1) -> None:
         super().__init__(plant, clock)
         self.unit = unit
         self.mute = False
         self.ramp_K_per_min: float | None = None
         self._fan_percent = 90.0
         self._shown_degC = self.setpoint_degC
-
-    def engine(self) -> Conversation:
-        """Lines that end with CR."""
-
-        def take(buffer: bytes) -> tuple[bytes, bytes] | None:
-            line, separator, rest = buffer.partition(b"\r")
-            return (self._answer(line.decode("latin-1").strip()), rest) if separator else None
-
-        return Conversation(self, take)
 
     def _nominal_degC(self) -> float:
         return self.acting_degC if self.ramp_K_per_min is None else self._shown_degC
@@ -291,10 +269,11 @@ class FakeWeiss(FakeClimateChamber):
             step_K = self.ramp_K_per_min * dt_s / 60
             self._shown_degC += max(-step_K, min(step_K, self.setpoint_degC - self._shown_degC))
 
-    def _answer(self, line: str) -> bytes:
-        if not line.startswith(f"${self.unit:02d}"):
+    def _reply(self, line: bytes) -> bytes:
+        text = line.decode("latin-1").strip()
+        if not text.startswith(f"${self.unit:02d}"):
             return b""
-        command, *fields = line[3:].split()
+        command, *fields = text[3:].split()
         if command == "I":
             return self._state().encode() + b"\r"
         if command != "E" or len(fields) != 8:
@@ -316,29 +295,193 @@ class FakeWeiss(FakeClimateChamber):
         return " ".join([*(f"{value:06.1f}" for pair in pairs for value in pair), digits])
 
 
-Made = TypeVar("Made", bound=FakeClimateChamber)
+# A Julabo circulator on its wire, with the plant behind its bath. Source: FL1201 owner's manual, chapter 11 (commands,
+# status and error messages); an `out` command is not answered, and is valid in remote control only.
 
 
-def built(bench: Bench, name: str, settings: Mapping[str, Any], chamber: Made) -> Made:
-    """At its address; its controller allows the set-points that it should."""
-    chamber.is_alone = not bench.has_relays
-    low_degC, high_degC = settings["limits_degC"]
-    chamber.limits_degC = low_degC, high_degC
-    bench.listen(name, settings["address"], chamber.engine)
-    return chamber
+_JULABO_VERSION = "JULABO TEST 1.0 V 1.20"
+_JULABO_INVALID = "-08 INVALID COMMAND"
+_JULABO_NOT_NOW = "-09 COMMAND NOT ALLOWED IN CURRENT OPERATING MODE"
 
 
-@fake("climate_chamber.espec", rank=CONTROL)
-def _build_espec(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeEspec:
-    return built(bench, name, settings, FakeEspec(bench.plant, bench.clock))
+class FakeJulabo(FakeClimateChamber):
+    """remote: whether somebody has chosen remote control at its panel. A message about a command stands until `status`
+    was asked once; alarm: the text of one that stands until it is cleared, such as 01 LOW LEVEL ALARM.
+
+    bank: the working temperature that acts, 0 for T1 (which is what sp_00 sets), 1 for T2, 2 for T3. external: a sensor
+    outside is controlled. degF: every temperature on its wire is. unknown: queries that this unit does not have, to
+    which it says nothing but -08 in its status, or answers it when `answers_unknown`.
+    """
+
+    def __init__(self, plant: Plant, clock: Now) -> None:
+        super().__init__(plant, clock)
+        self.remote = True
+        self.bank = 0
+        self.others_degC = (60.0, 80.0)  # T2, T3
+        self.external = self.degF = False
+        self.unknown: tuple[str, ...] = ()
+        self.answers_unknown = False
+        self._message = ""
+
+    @property
+    def acting_degC(self) -> float:
+        """Of the working temperature that is chosen; with a sensor outside the bath goes further than that."""
+        chosen_degC = (self.setpoint_degC, *self.others_degC)[self.bank]
+        return chosen_degC + 20.0 if self.external else chosen_degC
+
+    def _reply(self, line: bytes) -> bytes:
+        reply = self._answer(line.decode("latin-1").strip())
+        return reply.encode("ascii") + b"\r\n" if reply else b""
+
+    def _shown(self, degC: float) -> str:
+        return f"{degC * 9 / 5 + 32 if self.degF else degC:.2f}"
+
+    def _answer(self, command: str) -> str:
+        if command in self.unknown:
+            self._message = "" if self.answers_unknown else _JULABO_INVALID
+            return _JULABO_INVALID if self.answers_unknown else ""
+        match command:
+            case "version":
+                return _JULABO_VERSION
+            case "status":
+                return self._status()
+            case "in_pv_00":
+                return self._shown(self.actual_degC)
+            case "in_sp_00":
+                return self._shown(self.setpoint_degC)
+            case "in_mode_01":
+                return str(self.bank)
+            case "in_mode_04":
+                return str(int(self.external))
+            case "in_sp_06":
+                return str(int(self.degF))
+            case "in_mode_05":
+                return str(int(self.running))
+            case _:
+                self._message = self._order(command)
+                return ""
+
+    def _status(self) -> str:
+        message, self._message = self._message, ""
+        if self.alarm or message:
+            return f"-{self.alarm}" if self.alarm else message
+        words = f"{'REMOTE' if self.remote else 'MANUAL'} {'START' if self.running else 'STOP'}"
+        return f"0{2 * self.remote + self.running} {words}"
+
+    def _order(self, command: str) -> str:
+        """The message that it leaves, "" for one that was taken."""
+        if not self.remote:
+            return _JULABO_NOT_NOW
+        if found := re.fullmatch(r"out_sp_00 (-?\d+\.\d{1,2})", command):
+            degC = (float(found[1]) - 32) * 5 / 9 if self.degF else float(found[1])
+            if self.set(degC):
+                return ""
+            return "-10 VALUE TOO SMALL" if degC < self.limits_degC[0] else "-11 VALUE TOO LARGE"
+        if found := re.fullmatch(r"out_mode_05 ([01])", command):
+            self.switch(found[1] == "1")
+            return ""
+        return _JULABO_INVALID
 
 
-@fake("climate_chamber.cts", rank=CONTROL)
-def _build_cts(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeCts:
-    is_serial = settings["address"].startswith("serial:")
-    return built(bench, name, settings, FakeCts(bench.plant, bench.clock, settings["unit"], is_serial=is_serial))
+# A Weiss or Voetsch chamber with SIMSERV on its wire: fields are parted by a byte B6. Source: public transcripts.
 
 
-@fake("climate_chamber.ascii2", rank=CONTROL)
-def _build_ascii2(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeWeiss:
-    return built(bench, name, settings, FakeWeiss(bench.plant, bench.clock, settings["unit"]))
+_ACCEPTED, _NO_COMMAND, _BAD_PARAMETER, _NO_CHANNEL = "1", "-5", "-6", "-8"
+
+
+class FakeSimserv(FakeClimateChamber):
+    """Control variable 1; digital channel 1 starts, 2 is humidity. An unknown number is answered by -5, a set-point
+    outside of the limits by -6. gradient_K_per_min: upwards, 0 for none; None for a unit that does not know them.
+    A program goes on when the start channel is cleared, until it is ended (19015)."""
+
+    def __init__(self, plant: Plant, clock: Now, chamber: int = 1) -> None:
+        super().__init__(plant, clock)
+        self._chamber = str(chamber)
+        self.gradient_K_per_min: float | None = 0.0
+        self.serial_number = "58226123450010"
+
+    def _reply(self, line: bytes) -> bytes:
+        return self._answer(line.lstrip(b"\n").split(b"\xb6")) + b"\r\n"
+
+    def _answer(self, words: list[bytes]) -> bytes:
+        command, chamber, *arguments = [word.decode("latin-1") for word in words] + [""] * (2 - len(words))
+        if chamber != self._chamber:
+            return b"-4"
+        reads = {
+            ("10010", ()): "2" if self.program_degC is None else "4",
+            ("10012", ()): str(1 + 2 * self.running + 8 * bool(self.alarm)),
+            ("11002", ("1",)): f"{self.setpoint_degC:.1f}",
+            ("11004", ("1",)): f"{self.actual_degC:.2f}",
+            ("11007", ("1",)): f"{self.limits_degC[0]:.1f}",
+            ("11009", ("1",)): f"{self.limits_degC[1]:.1f}",
+            ("14003", ("1",)): str(int(self.running)),
+            ("14003", ("2",)): str(int(self.humidity_on)),
+            ("99997", ("1",)): "VT3 7034",
+            ("99997", ("2",)): "2014",
+            ("99997", ("3",)): self.serial_number,
+            **self._gradients(),
+            **self._messages(),
+        }
+        value = reads.get((command, tuple(arguments)))
+        return b"1\xb6" + value.encode("latin-1") if value is not None else self._order(command, arguments).encode()
+
+    def _gradients(self) -> dict[tuple[str, tuple[str, ...]], str]:
+        if self.gradient_K_per_min is None:
+            return {}
+        return {("11066", ("1",)): f"{self.gradient_K_per_min:.1f}", ("11070", ("1",)): "0.0"}
+
+    def _messages(self) -> dict[tuple[str, tuple[str, ...]], str]:
+        """Two: an information that always stands, and the alarm."""
+        rows = (("info", "4", "1"), (f"alarm {self.alarm}", "1", str(int(bool(self.alarm)))))
+        return {("17002", ()): str(len(rows))} | {
+            (number, (str(index),)): row[column]
+            for index, row in enumerate(rows, 1)
+            for number, column in (("17007", 0), ("17005", 1), ("17009", 2))
+        }
+
+    def _order(self, command: str, arguments: list[str]) -> str:
+        match command, arguments:
+            case "11001", [str(variable), str(value)]:
+                if variable != "1":
+                    return _NO_CHANNEL
+                taken = re.fullmatch(r"-?\d+(\.\d+)?", value) and self.set(float(value))
+                return _ACCEPTED if taken else _BAD_PARAMETER
+            case "19015", []:
+                self.program_degC = None
+                return _ACCEPTED
+            case "14001", ["1", "0" | "1"] if self.program_degC is None:
+                self.switch(arguments[1] == "1")
+                return _ACCEPTED
+            case "14001", ["1", "0" | "1"]:
+                return _ACCEPTED
+            case "14001", ["2", "0" | "1"]:
+                self.humidity_on = arguments[1] == "1"
+                return _ACCEPTED
+            case "14001" | "14003", _:
+                return _NO_CHANNEL
+            case _:
+                return _NO_COMMAND
+
+
+def chamber_fake(protocol: str, make: Callable[[Plant, Now, Mapping[str, Any]], FakeClimateChamber]) -> None:
+    """A make answers at its address under its protocol; its controller allows the set-points that it should."""
+
+    @fake(f"climate_chamber.{protocol}", rank=CONTROL)
+    def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeClimateChamber:
+        chamber = make(bench.plant, bench.clock, settings)
+        chamber.is_alone = not bench.has_relays
+        low_degC, high_degC = settings["limits_degC"]
+        chamber.limits_degC = low_degC, high_degC
+        bench.listen(name, settings["address"], chamber.engine)
+        return chamber
+
+
+def _cts(plant: Plant, clock: Now, settings: Mapping[str, Any]) -> FakeCts:
+    return FakeCts(plant, clock, settings["unit"], is_serial=settings["address"].startswith("serial:"))
+
+
+chamber_fake("espec", lambda plant, clock, _: FakeEspec(plant, clock))
+chamber_fake("cts", _cts)
+chamber_fake("ascii2", lambda plant, clock, settings: FakeWeiss(plant, clock, settings["unit"]))
+chamber_fake("julabo", lambda plant, clock, _: FakeJulabo(plant, clock))
+chamber_fake("simserv", lambda plant, clock, settings: FakeSimserv(plant, clock, settings["chamber"]))

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from thermostand.drivers.sim.fakes import OUTPUT, Bench, fake
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
     OPERATION_ERROR,
-    Refusal,
-    Timeline,
+    BusUnit,
+    ModbusRefusal,
     answer,
     reads_bits,
     reads_words,
@@ -45,13 +46,7 @@ HEX_FULL_SCALE = 0xFFFF
 Refreshed = Literal["requests", "writes", "nothing"]
 
 
-class Heated(Timeline, Protocol):
-    """What the first output drives."""
-
-    heater_on_fraction: float
-
-
-class FakeHeatModule:
+class FakeHeatModule(BusUnit):
     """The module as unit `unit`. Its output `channel` is the current into a power controller of 4 to 20 mA. As
     delivered: 4..20 mA, all values at 4 mA, watchdog off.
 
@@ -63,9 +58,8 @@ class FakeHeatModule:
     it says that it is.
     """
 
-    def __init__(self, plant: Heated, clock: Now, unit: int, channel: int) -> None:
-        self.unit = unit
-        self.silent = False
+    def __init__(self, plant: Plant, clock: Now, unit: int, channel: int) -> None:
+        super().__init__(plant, clock, unit)
         self.refuses = False
         self.safe_fixed = False
         self.lost_writes = False
@@ -80,13 +74,11 @@ class FakeHeatModule:
         self.coils = {WATCHDOG_MODE: False, WATCHDOG_ENABLED: False, ENGINEERING: True, TRIPPED: False}
         self.timeout_tenths = 0
         self.trips = 0
-        self._plant = plant
-        self._clock = clock
         self._channel = channel
         self._heard_ns = 0
         self._flows_at_mA = 4.0  # with a slew rate, at _flows_at_ns
         self._flows_at_ns = clock.now_ns()
-        self._functions = {
+        self.functions = {
             0x01: reads_bits(self._read_coils),
             0x03: reads_words(self._read_holding),
             0x04: reads_words(self._read_inputs),
@@ -101,7 +93,7 @@ class FakeHeatModule:
         with self._now():
             if self.silent:
                 return None
-            reply = answer(pdu, self._functions)
+            reply = answer(pdu, self.functions)
             is_write = pdu[0] in (0x05, 0x06, 0x10)
             if self.refreshed_by == "requests" or (self.refreshed_by == "writes" and is_write):
                 self._heard_ns = self._now_ns
@@ -127,9 +119,7 @@ class FakeHeatModule:
 
     @contextmanager
     def _now(self) -> Generator[None]:
-        with self._plant.lock:
-            self._now_ns = self._clock.now_ns()
-            self._plant.advance(self._now_ns)
+        with super()._now():
             self._watch(self._now_ns)
             yield
 
@@ -170,14 +160,14 @@ class FakeHeatModule:
     def _read_coils(self, address: int, count: int) -> list[bool]:
         wanted = range(address, address + count)
         if not all(each in self.coils for each in wanted):
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         return [self.coils[each] for each in wanted]
 
     def _write_coil(self, address: int, value: int) -> bool:
         if address not in self.coils:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         if value not in (COIL_ON, COIL_OFF):
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         if address == TRIPPED:  # 1 clears it
             self.coils[TRIPPED] = self.coils[TRIPPED] and value != COIL_ON
         else:
@@ -187,7 +177,7 @@ class FakeHeatModule:
 
     def _read_inputs(self, address: int, count: int) -> list[int]:
         if address < READ_BACK or address + count > READ_BACK + OUTPUTS:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         first = address - READ_BACK
         return [self._word(self._flows_mA(each), each) for each in range(first, first + count)]
 
@@ -217,13 +207,13 @@ class FakeHeatModule:
     def _write_register(self, address: int, value: int) -> bool:
         if address == TIMEOUT:
             if value > 0xFF:
-                raise Refusal(ILLEGAL_VALUE)
+                raise ModbusRefusal(ILLEGAL_VALUE)
             self.timeout_tenths = value
         elif address == TRIPS and value == 0:
             self.trips = 0
         elif TYPE_CODES <= address < TYPE_CODES + OUTPUTS:
             if value not in RANGES_mA:
-                raise Refusal(ILLEGAL_VALUE)
+                raise ModbusRefusal(ILLEGAL_VALUE)
             self.type_codes[address - TYPE_CODES] = value
         else:
             self._set(*self._table(address), value)
@@ -236,7 +226,7 @@ class FakeHeatModule:
             return
         if table is self.values_mA and self.coils[TRIPPED]:
             if self.refuses:
-                raise Refusal(OPERATION_ERROR)
+                raise ModbusRefusal(OPERATION_ERROR)
             if not self.coils[WATCHDOG_MODE]:
                 return
             self.coils[TRIPPED] = False
@@ -249,7 +239,7 @@ class FakeHeatModule:
         for begin, table in tables:
             if begin <= address < begin + OUTPUTS:
                 return table, address - begin
-        raise Refusal(ILLEGAL_ADDRESS)
+        raise ModbusRefusal(ILLEGAL_ADDRESS)
 
     def _word(self, current_mA: float, output: int) -> int:
         low_mA, high_mA = RANGES_mA[self.type_codes[output]]

@@ -8,9 +8,12 @@ Sources: Modbus Application Protocol 1.1b3 (chapters 6 and 7), Modbus over Seria
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Protocol
+
+from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.foundation.clock import Now
 
 ILLEGAL_FUNCTION = 1
 ILLEGAL_ADDRESS = 2
@@ -41,25 +44,31 @@ class Unit(Protocol):
         ...
 
 
-class Timeline(Protocol):
-    """The part of the plant every unit needs: one lock, one time, steps to hook into."""
+class BusUnit:
+    """A unit with the plant behind it. functions: what it offers, by function code. silent: it does not answer."""
 
-    @property
-    def lock(self) -> AbstractContextManager[bool]:
-        """Guards everything behind the wires."""
-        ...
+    functions: Mapping[int, Handler]
 
-    @property
-    def on_step(self) -> list[Callable[[int, float], None]]:
-        """Called with (begin of the step in ns, its length in s) before the heat is integrated."""
-        ...
+    def __init__(self, plant: Plant, clock: Now, unit: int) -> None:
+        self.unit = unit
+        self.silent = False
+        self._plant = plant
+        self._clock = clock
+        self._now_ns = clock.now_ns()
 
-    def advance(self, now_ns: int) -> None:
-        """Integrate up to now."""
-        ...
+    def handle(self, pdu: bytes) -> bytes | None:
+        """The reply to a request."""
+        with self._now():
+            return None if self.silent else answer(pdu, self.functions)
+
+    @contextmanager
+    def _now(self) -> Generator[None]:
+        """The plant at the clock's present time, _now_ns."""
+        with self._plant.at(self._clock) as self._now_ns:
+            yield
 
 
-class Refusal(Exception):
+class ModbusRefusal(Exception):
     """The unit answers with an exception code, 1..4."""
 
     def __init__(self, code: int) -> None:
@@ -76,9 +85,9 @@ def answer(pdu: bytes, functions: Mapping[int, Handler]) -> bytes | None:
     handler = functions.get(code)
     try:
         if handler is None:
-            raise Refusal(ILLEGAL_FUNCTION)
+            raise ModbusRefusal(ILLEGAL_FUNCTION)
         reply = handler(data)
-    except Refusal as refusal:
+    except ModbusRefusal as refusal:
         return bytes([code | 0x80, refusal.code])
     except struct.error:  # too short or too long for its function
         return bytes([code | 0x80, ILLEGAL_VALUE])
@@ -91,7 +100,7 @@ def reads_words(read: Callable[[int, int], Sequence[int]], limit: int = 125) -> 
     def handler(data: bytes) -> bytes:
         address, count = struct.unpack(">HH", data)
         if not 1 <= count <= limit:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         words = read(address, count)
         return struct.pack(f">B{count}H", 2 * count, *words)
 
@@ -104,7 +113,7 @@ def reads_bits(read: Callable[[int, int], Sequence[bool]]) -> Handler:
     def handler(data: bytes) -> bytes:
         address, count = struct.unpack(">HH", data)
         if not 1 <= count <= 2000:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         number = sum(bit << position for position, bit in enumerate(read(address, count)))
         size = (count + 7) // 8
         return bytes([size]) + number.to_bytes(size, "little")
@@ -128,7 +137,7 @@ def writes_words(write: Callable[[int, Sequence[int]], None], limit: int = 123) 
     def handler(data: bytes) -> bytes:
         address, count, size = struct.unpack_from(">HHB", data)
         if not 1 <= count <= limit or size != 2 * count:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         write(address, struct.unpack(f">{count}H", data[5:]))
         return data[:4]
 
@@ -141,7 +150,7 @@ def writes_bits(write: Callable[[int, Sequence[bool]], None]) -> Handler:
     def handler(data: bytes) -> bytes:
         address, count, size = struct.unpack_from(">HHB", data)
         if not 1 <= count <= 1968 or size != (count + 7) // 8 or len(data) != 5 + size:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         number = int.from_bytes(data[5:], "little")
         write(address, [bool(number >> position & 1) for position in range(count)])
         return data[:4]
@@ -152,7 +161,7 @@ def writes_bits(write: Callable[[int, Sequence[bool]], None]) -> Handler:
 def echoes(data: bytes) -> bytes:
     """FC 08, sub-function 0: the request comes back."""
     if data[:2] != b"\x00\x00":
-        raise Refusal(ILLEGAL_VALUE)
+        raise ModbusRefusal(ILLEGAL_VALUE)
     return data
 
 

@@ -40,9 +40,7 @@ class FakeProbe:
         """The lines that a command brings, "" for one that it does not know."""
         if self.silent:
             return ""
-        with self._plant.lock:
-            now_ns = self._clock.now_ns()
-            self._plant.advance(now_ns)
+        with self._plant.at(self._clock) as now_ns:
             T_degC = self._plant.laboratory_degC
         chance = random.Random(f"{self._seed} {self._kind} {now_ns}")
         T_degC += chance.gauss(0.0, _NOISE_K)

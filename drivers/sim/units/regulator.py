@@ -6,59 +6,185 @@ the plant; nothing depends on when the registers are read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
-from enum import IntEnum
-from typing import Any, Protocol
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum, IntEnum
+from typing import Any, NamedTuple
 
 from thermostand.drivers.sim.fakes import CONTROL, Bench, fake
-from thermostand.drivers.sim.units import self_tuning
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
     OPERATION_ERROR,
-    Refusal,
-    Timeline,
-    answer,
+    BusUnit,
+    ModbusRefusal,
     echoes,
     reads_words,
     writes_one,
     writes_words,
 )
-from thermostand.drivers.sim.units.pid import OFF, Outputs, PidState, on_time_ns, resume, start, step
-from thermostand.drivers.sim.units.regulator_table import (
-    COOL_PERIOD,
-    HEAT_PERIOD,
-    INPUT_SHIFT,
-    MV_AT_ERROR,
-    MV_AT_STOP,
-    MV_LOWER,
-    MV_UPPER,
-    PARAMETERS,
-    PT100_RANGE_DEGC,
-    SETPOINT,
-    TUNED,
-    Writable,
-    gains_of,
-    stored_at,
-    to_value,
-    to_word,
-)
+from thermostand.drivers.sim.units.pid import OFF, Gains, Outputs, PidState, Side, on_time_ns, resume, start, step
 from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
+
+# The stored registers of the fake Omron E5CC, two-byte mode: address, value at delivery, range, decimals.
+#
+# Sources: communications manual H175 section 5 (0x21.., 0x29.., 0x2A.., 0x2C.. to 0x2E..), H186 for 0x2701..0x2723.
+# The proportional bands and times are not the factory's but those a commissioning of the simulated chamber found.
+
+
+PT100_RANGE_DEGC = (-199.9, 500.0)  # input type 1
+
+
+class Writable(Enum):
+    """When a register takes a value over communications."""
+
+    ALWAYS = "always"
+    STOPPED = "only while stopped"
+    SETUP = "only in setup area 1, which the fake never enters"
+
+
+DISPLAY = None  # decimals of a temperature: as many as the display shows, register 0x2410
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRegister:
+    """One stored register: value at delivery, range, decimals on the wire."""
+
+    default: float
+    low: float
+    high: float
+    decimals: int | None
+    writable: Writable = Writable.ALWAYS
+
+
+SETPOINT = 0x2103
+COOL_BAND, COOL_INTEGRAL, COOL_DERIVATIVE, DEAD_BAND = 0x2701, 0x2702, 0x2703, 0x2704
+HEAT_PERIOD, COOL_PERIOD = 0x2708, 0x2709
+MV_AT_STOP, MV_AT_ERROR = 0x270F, 0x2711
+INPUT_SHIFT = 0x2723
+HEAT_BAND, HEAT_INTEGRAL, HEAT_DERIVATIVE = 0x2A00, 0x2A01, 0x2A02
+MV_UPPER, MV_LOWER = 0x2A05, 0x2A06
+TUNED = (HEAT_BAND, COOL_BAND), (HEAT_INTEGRAL, COOL_INTEGRAL), (HEAT_DERIVATIVE, COOL_DERIVATIVE)  # by autotuning
+SETPOINT_0 = 0x2900  # the same set point as 0x2103 while multi-SP is off
+
+# Stored only. Alarm 1: value, upper and lower limit of an alarm of type 0. SP1..SP7 while multi-SP is off.
+ALARM = StoredRegister(0.0, -199.9, 999.9, DISPLAY)
+SPARE_SETPOINT = StoredRegister(0.0, *PT100_RANGE_DEGC, DISPLAY)
+
+PARAMETERS = {
+    SETPOINT: StoredRegister(0.0, *PT100_RANGE_DEGC, DISPLAY),
+    **dict.fromkeys((0x2104, 0x2105, 0x2106), ALARM),
+    COOL_BAND: StoredRegister(3.0, 0.1, 999.9, DISPLAY),
+    COOL_INTEGRAL: StoredRegister(180, 0, 3999, 0),
+    COOL_DERIVATIVE: StoredRegister(20, 0, 3999, 0),
+    DEAD_BAND: StoredRegister(0.0, -199.9, 999.9, DISPLAY),
+    HEAT_PERIOD: StoredRegister(2, -2, 99, 0, Writable.STOPPED),
+    COOL_PERIOD: StoredRegister(20, -2, 99, 0, Writable.STOPPED),
+    MV_AT_STOP: StoredRegister(0.0, -105.0, 105.0, 1),
+    MV_AT_ERROR: StoredRegister(0.0, -105.0, 105.0, 1),
+    0x2705: StoredRegister(0.0, -105.0, 105.0, 1),  # stored only: manual reset, the output of a PD control
+    0x2706: StoredRegister(1.0, 0.1, 999.9, DISPLAY),  # stored only: hysteresis of ON/OFF control, heating
+    0x2707: StoredRegister(1.0, 0.1, 999.9, DISPLAY),  # and cooling
+    0x2713: StoredRegister(0.0, 0.0, 100.0, 1),  # stored only: MV change rate limit, 0 = none
+    INPUT_SHIFT: StoredRegister(0.0, -199.9, 999.9, DISPLAY),
+    HEAT_BAND: StoredRegister(3.0, 0.1, 999.9, DISPLAY),
+    HEAT_INTEGRAL: StoredRegister(180, 0, 3999, 0),
+    HEAT_DERIVATIVE: StoredRegister(20, 0, 3999, 0),
+    MV_UPPER: StoredRegister(100.0, 0.0, 105.0, 1),
+    MV_LOWER: StoredRegister(-100.0, -105.0, 0.0, 1),
+    **dict.fromkeys(range(0x290E, 0x2963, 14), SPARE_SETPOINT),
+    0x2C00: StoredRegister(1, 0, 29, 0, Writable.SETUP),  # input type: Pt100, -199.9..500.0 degC
+    0x2D14: StoredRegister(1, 0, 1, 0, Writable.SETUP),  # 2-PID
+    0x2E06: StoredRegister(1, 0, 10, 0, Writable.SETUP),  # output 1: heating
+    0x2E07: StoredRegister(2, 0, 10, 0, Writable.SETUP),  # output 2: cooling
+}
+
+
+def gains_of(ram: Mapping[int, float]) -> Gains:
+    """The constants of the PID that these registers hold."""
+    return Gains(
+        heat=Side(ram[HEAT_BAND], ram[HEAT_INTEGRAL], ram[HEAT_DERIVATIVE], ram[MV_UPPER]),
+        cool=Side(ram[COOL_BAND], ram[COOL_INTEGRAL], ram[COOL_DERIVATIVE], -ram[MV_LOWER]),
+        dead_band_K=ram[DEAD_BAND],
+    )
+
+
+def stored_at(address: int) -> int:
+    """Where the value of an address is kept: SP0 is the set point."""
+    return SETPOINT if address == SETPOINT_0 else address
+
+
+def to_word(value: float, decimals: int) -> int:
+    """A value as a 16-bit two's complement word with that many decimals."""
+    return max(-0x8000, min(0x7FFF, round(value * 10**decimals))) & 0xFFFF
+
+
+def to_value(word: int, decimals: int) -> float:
+    """A word back as a value."""
+    return (word - 0x10000 if word & 0x8000 else word) / 10**decimals
+
+
+# What an E5CC does while it tunes itself: a limit cycle about the set point, and the constants that come of it.
+#
+# The manual describes the cycle (100 or 40 % of the outputs, about the set point) and that the constants are stored at
+# its end. It says neither the formula nor the hysteresis: here those of Ziegler and Nichols, and 0.2 K.
+
+
+HYSTERESIS_K = 0.2
+SWITCHINGS = 6  # the first swing is not yet periodic: two periods after it
+
+
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """Where the limit cycle is: whether it heats, when it switched, and the lowest and highest PV - SP since."""
+
+    heats: bool
+    switched_s: tuple[float, ...] = ()
+    extremes_K: tuple[float, ...] = ()
+    extreme_K: float = 0.0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has shown enough."""
+        return len(self.switched_s) >= SWITCHINGS
+
+
+class Constants(NamedTuple):
+    """Band in K for 100 % of the heat, times in s."""
+
+    band_K: float
+    integral_s: float
+    derivative_s: float
+
+
+def begin(error_K: float) -> Cycle:
+    """At a PV that is error_K above the set point."""
+    return Cycle(heats=error_K < 0, extreme_K=error_K)
+
+
+def cycle_step(cycle: Cycle, error_K: float, time_s: float) -> Cycle:
+    """After a while at this PV - SP."""
+    extreme_K = (min if cycle.heats else max)(cycle.extreme_K, error_K)
+    switches = error_K > HYSTERESIS_K if cycle.heats else error_K < -HYSTERESIS_K
+    if not switches:
+        return replace(cycle, extreme_K=extreme_K)
+    return Cycle(not cycle.heats, (*cycle.switched_s, time_s), (*cycle.extremes_K, extreme_K), error_K)
+
+
+def constants(cycle: Cycle, swing_percent: float) -> Constants:
+    """Of a cycle that is over, whose output went that far from one end to the other."""
+    period_s = (cycle.switched_s[-1] - cycle.switched_s[-5]) / 2
+    amplitude_K = (max(cycle.extremes_K[-4:]) - min(cycle.extremes_K[-4:])) / 2
+    effective_K = math.sqrt(max(amplitude_K**2 - HYSTERESIS_K**2, 1e-4))
+    ultimate_percent_per_K = 2 * swing_percent / (math.pi * effective_K)
+    return Constants(100 / (0.6 * ultimate_percent_per_K), period_s / 2, period_s / 8)
+
 
 MOST_WORDS = 104
 STILL_AIR_LAG_S = 30.0  # of a probe that hangs in the laboratory
 SHORT_PERIODS_S = {-2: 0.1, -1: 0.2, 0: 0.5}  # coded values of the control period, else whole seconds
-
-
-class Chamber(Timeline, Protocol):
-    """What the regulator sees and moves of the plant."""
-
-    now_ns: int
-    heater_on_fraction: float
-    chamber_degC: float  # where the regulator's probe is
-    air_degC: float  # where the thermometer near the camera is
-    laboratory_degC: float
 
 
 class Mode(IntEnum):
@@ -74,7 +200,7 @@ class Mode(IntEnum):
 DIFFERS_BIT = 5  # RAM differs from EEPROM
 
 
-class FakeRegulator:
+class FakeRegulator(BusUnit):
     """E5CC on the bus as unit `unit`. Powers up stopped, in backup mode, with communications writing disabled.
 
     Faults: silent; compoway (the factory protocol is selected: no answer on Modbus); sensor_break; ad_error;
@@ -85,10 +211,9 @@ class FakeRegulator:
     eeprom_writes counts worn cells.
     """
 
-    def __init__(self, plant: Chamber, clock: Now, unit: int) -> None:
-        self.unit = unit
+    def __init__(self, plant: Plant, clock: Now, unit: int) -> None:
+        super().__init__(plant, clock, unit)
         self.eeprom_writes = 0
-        self.silent = False
         self.compoway = False
         self.sensor_break = False
         self.ad_error = False
@@ -103,13 +228,11 @@ class FakeRegulator:
         self.ramp_K_per_min: float | None = None
         self._ramped_degC: float | None = None
         self._tuning_share = 1.0
-        self._cycle: self_tuning.Cycle | None = None
-        self._plant = plant
-        self._clock = clock
+        self._cycle: Cycle | None = None
         self._drifted_K = 0.0
         self._felt_degC = plant.chamber_degC  # by the probe, wherever it is
         self._eeprom = {address: parameter.default for address, parameter in PARAMETERS.items()}
-        self._functions = {
+        self.functions = {
             0x03: reads_words(self._read, MOST_WORDS),
             0x06: writes_one(self._write_one),
             0x08: echoes,
@@ -124,13 +247,12 @@ class FakeRegulator:
 
     def handle(self, pdu: bytes) -> bytes | None:
         """The reply to a request; None when silent and for a software reset."""
-        with self._now():
-            return None if self.silent or self.compoway else answer(pdu, self._functions)
+        return None if self.compoway else super().handle(pdu)
 
     def _read(self, address: int, count: int) -> list[int]:
         first = stored_at(address)
         if first not in PARAMETERS and first not in self._measurements:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         return [self._register(stored_at(each)) for each in range(address, address + count)]
 
     def _register(self, address: int) -> int:
@@ -177,17 +299,17 @@ class FakeRegulator:
         """Write all or nothing; refused in the order of H175 4-1-3: address, value, operating state."""
         addresses = [stored_at(each) for each in range(address, address + len(words))]
         if not all(each in PARAMETERS for each in addresses):
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         values = [to_value(word, self._decimals(each)) for each, word in zip(addresses, words, strict=True)]
         for each, value in zip(addresses, values, strict=True):
             if not PARAMETERS[each].low <= value <= PARAMETERS[each].high:
-                raise Refusal(ILLEGAL_VALUE)
+                raise ModbusRefusal(ILLEGAL_VALUE)
         if (
             Mode.WRITING not in self._modes
             or Mode.TUNING in self._modes
             or not all(self._takes(each) for each in addresses)
         ):
-            raise Refusal(OPERATION_ERROR)
+            raise ModbusRefusal(OPERATION_ERROR)
         for each, value in zip(addresses, values, strict=True):
             self._store(each, value, keep=Mode.RAM not in self._modes)
 
@@ -215,9 +337,9 @@ class FakeRegulator:
         """Obey a command; False when it is not to be answered."""
         command = self._commands.get(value)
         if command is None:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         if value not in (0x0000, 0x0001) and Mode.WRITING not in self._modes:
-            raise Refusal(OPERATION_ERROR)
+            raise ModbusRefusal(OPERATION_ERROR)
         command()
         return value != 0x0600
 
@@ -250,7 +372,7 @@ class FakeRegulator:
         """A limit cycle with that share of the outputs, around the set point, until it is cancelled or has shown the
         constants, which are stored then."""
         if self._modes & {Mode.STOP, Mode.MANUAL}:
-            raise Refusal(OPERATION_ERROR)
+            raise ModbusRefusal(OPERATION_ERROR)
         self._tuning_share, self._cycle = share, None
         self._modes.add(Mode.TUNING)
 
@@ -315,13 +437,6 @@ class FakeRegulator:
 
     # Control.
 
-    @contextmanager
-    def _now(self) -> Generator[None]:
-        with self._plant.lock:
-            self._now_ns = self._clock.now_ns()
-            self._plant.advance(self._now_ns)
-            yield
-
     def _feel(self, dt_s: float) -> None:
         """The probe takes the temperature of its place; in the laboratory, in still air, slowly."""
         plant = self._plant
@@ -361,10 +476,10 @@ class FakeRegulator:
     def _tuned(self, error_K: float) -> Outputs:
         """One step of the limit cycle; at its end the constants are those it has shown."""
         upper, lower = (self._tuning_share * self._ram[limit] for limit in (MV_UPPER, MV_LOWER))
-        cycle = self._cycle or self_tuning.begin(error_K)
-        self._cycle = cycle = self_tuning.step(cycle, error_K, self._plant.now_ns / NS_PER_S)
+        cycle = self._cycle or begin(error_K)
+        self._cycle = cycle = cycle_step(cycle, error_K, self._plant.now_ns / NS_PER_S)
         if cycle.is_over:
-            found = self_tuning.constants(cycle, upper - lower)
+            found = constants(cycle, upper - lower)
             for addresses, value in zip(TUNED, found, strict=True):
                 for address in addresses:
                     known = PARAMETERS[address]

@@ -6,19 +6,18 @@ that a repeated timed-on starts its time again, were not confirmed on a board.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from thermostand.drivers.sim.fakes import CONTACTS, SWITCHES, Bench, fake
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
-    Refusal,
-    Timeline,
-    answer,
+    BusUnit,
+    ModbusRefusal,
     reads_bits,
     reads_words,
     writes_bits,
@@ -34,22 +33,6 @@ LONGEST_TIME = 0x7FFF
 ON, OFF, TOGGLE = 0xFF00, 0x0000, 0x5500
 ADDRESS_REGISTER, VERSION_REGISTER = 0x4000, 0x8000
 VERSION = 200  # V2.00
-
-
-class Contacts(Timeline, Protocol):
-    """What the relays switch in the plant."""
-
-    heater_enabled: bool
-    heater_on_fraction: float
-    compressor_on: bool
-
-    @property
-    def camera_powered(self) -> bool:
-        """Whether the camera's supply is on."""
-        ...
-
-    @camera_powered.setter
-    def camera_powered(self, powered: bool) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +54,7 @@ class Relay:
         return share if self.closed else 1.0 - share
 
 
-class FakeRelays:
+class FakeRelays(BusUnit):
     """The board as unit `unit`; `channels` says which relay, counted from 0, switches which contact of the plant:
     heater_enable, compressor, camera_power, heat (the SSR of a stand without a controller). All relays are open at
     power-up. closed_inputs: of the eight digital inputs that some of these boards have, None for one without.
@@ -80,29 +63,26 @@ class FakeRelays:
     the coil); rearms False (a repeated timed-on does not start its time again); times False (a timed-on stays on).
     """
 
-    def __init__(self, plant: Contacts, clock: Now, unit: int, channels: Mapping[str, int]) -> None:
-        switches: dict[str, Callable[[bool], None]] = {
-            "heater_enable": self._enable_heater,
-            "compressor": self._run_compressor,
-            "camera_power": self._power_camera,
-            "heat": self._heat,
+    def __init__(self, plant: Plant, clock: Now, unit: int, channels: Mapping[str, int]) -> None:
+        switches = {
+            "heater_enable": "heater_enabled",
+            "compressor": "compressor_on",
+            "camera_power": "camera_powered",
+            "heat": "heater_on_fraction",
         }
         if not channels.keys() <= switches.keys() or not set(channels.values()) <= set(range(RELAYS)):
             raise ValueError(f"relay channels {dict(channels)}: expected {', '.join(switches)} -> 0..{RELAYS - 1}")
-        self.unit = unit
+        super().__init__(plant, clock, unit)
         self.version = VERSION
-        self.silent = False
         self.lost_writes = False
         self.welded: set[str] = set()
         self.closed_inputs: set[int] | None = None
         self.rearms = True
         self.times = True
-        self._plant = plant
-        self._clock = clock
         self._channels = dict(channels)
         self._switches = switches
         self._relays = [Relay()] * RELAYS
-        self._functions = {
+        self.functions = {
             0x01: reads_bits(self._read_coils),
             0x02: reads_bits(self._read_inputs),
             0x03: reads_words(self._read_registers),
@@ -111,11 +91,6 @@ class FakeRelays:
             0x0F: writes_bits(self._write_coils),
         }
         plant.on_step.append(self._on_step)
-
-    def handle(self, pdu: bytes) -> bytes | None:
-        """The reply to a request."""
-        with self._now():
-            return None if self.silent else answer(pdu, self._functions)
 
     def power_cycle(self) -> None:
         """Off and on again: every relay is open."""
@@ -134,7 +109,7 @@ class FakeRelays:
 
     def _read_inputs(self, address: int, count: int) -> list[bool]:
         if self.closed_inputs is None:
-            raise Refusal(ILLEGAL_FUNCTION)
+            raise ModbusRefusal(ILLEGAL_FUNCTION)
         _check_span(address, count)
         return [channel in self.closed_inputs for channel in range(address, address + count)]
 
@@ -145,17 +120,17 @@ class FakeRelays:
             self._set_timed(relay, value, closed=base == TIMED_ON)
         elif address < RELAYS or address == ALL_RELAYS:
             if value not in (ON, OFF, TOGGLE):
-                raise Refusal(ILLEGAL_VALUE)
+                raise ModbusRefusal(ILLEGAL_VALUE)
             for each in range(RELAYS) if address == ALL_RELAYS else (address,):
                 self._set(each, Relay(not self._read_coils(each, 1)[0] if value == TOGGLE else value == ON))
         else:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         self._switch(self._now_ns)
         return True
 
     def _set_timed(self, relay: int, time: int, *, closed: bool) -> None:
         if not 1 <= time <= LONGEST_TIME:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         last = self._relays[relay]
         runs = last.closed == closed and last.until_ns is not None and self._now_ns < last.until_ns
         if self.rearms or not runs:
@@ -174,26 +149,19 @@ class FakeRelays:
     def _read_registers(self, address: int, count: int) -> list[int]:
         values = {ADDRESS_REGISTER: self.unit, VERSION_REGISTER: self.version}
         if address not in values or count != 1:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         return [values[address]]
 
     def _write_register(self, address: int, value: int) -> bool:
         if address != ADDRESS_REGISTER:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         if not 1 <= value <= 255:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         self.unit = value
         return True
 
     # Behind the relays. A relay's state is a pure function of its last command and the time, so that a run does not
     # depend on when the coils are read; the plant takes it over at the begin of each of its steps.
-
-    @contextmanager
-    def _now(self) -> Generator[None]:
-        with self._plant.lock:
-            self._now_ns = self._clock.now_ns()
-            self._plant.advance(self._now_ns)
-            yield
 
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         self._switch(time_ns)
@@ -204,27 +172,15 @@ class FakeRelays:
 
     def _switch(self, time_ns: int) -> None:
         for channel in self._channels:
-            self._switches[channel](self._conducts(channel, time_ns))
+            setattr(self._plant, self._switches[channel], self._conducts(channel, time_ns))
 
     def _conducts(self, channel: str, time_ns: int) -> bool:
         return channel in self.welded or self._relays[self._channels[channel]].closed_at(time_ns)
 
-    def _enable_heater(self, closed: bool) -> None:
-        self._plant.heater_enabled = closed
-
-    def _run_compressor(self, closed: bool) -> None:
-        self._plant.compressor_on = closed
-
-    def _heat(self, closed: bool) -> None:
-        self._plant.heater_on_fraction = float(closed)
-
-    def _power_camera(self, closed: bool) -> None:
-        self._plant.camera_powered = closed
-
 
 def _check_span(address: int, count: int) -> None:
     if address + count > RELAYS:
-        raise Refusal(ILLEGAL_ADDRESS)
+        raise ModbusRefusal(ILLEGAL_ADDRESS)
 
 
 @fake("relays", rank=SWITCHES)

@@ -6,23 +6,130 @@ The type codes and the name bytes were not confirmed on a module.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import random
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from thermostand.drivers.sim.fakes import MEASURE, Bench, fake
-from thermostand.drivers.sim.units.adam_4015 import FakeAdam4015
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
-    Refusal,
+    BusUnit,
+    ModbusRefusal,
     reads_bits,
     reads_words,
     writes_one,
 )
-from thermostand.drivers.sim.units.rtd_sensors import CHANNELS, Places, RtdModule, check_span
 from thermostand.foundation.clock import Now
+
+# Pt100 sensors where the plant has them, as the converter of an RTD module sees them, of whatever make it is.
+
+
+CHANNELS = 6
+
+STILL_AIR_LAG_S = 30.0  # of a sensor that hangs in the laboratory
+NOISE_K = 0.003
+NOISY_K = 1.0
+
+
+class RtdModule(BusUnit):
+    """A module of six channels as unit `unit`; `channels` says which sensor is on which, counted from `first` on:
+    granite_inside, granite_outside, artifact, air, laboratory; any other name hangs in the chamber's air. Channels
+    without a sensor are open.
+
+    The noise of a reading is a pure function of (seed, channel, grid time of the plant), however often it is read.
+    Faults, by channel number: open_channels, shorted_channels, stuck_degC (the converter gives this and no noise),
+    held_degC (the sensor is held there), noisy_channel (1 K instead of 3 mK), offset_K, drift_K_per_h, pulled_out (of
+    the chamber). air_exchanged: the air's sensor is where the regulator's probe belongs. silent.
+    """
+
+    def __init__(
+        self, plant: Plant, clock: Now, unit: int, channels: Mapping[str, int], seed: int, first: int = 0
+    ) -> None:
+        places: dict[str, Callable[[], float]] = {
+            "granite_inside": lambda: plant.granite_inside_degC,
+            "granite_outside": lambda: plant.granite_outside_degC,
+            "artifact": lambda: plant.artifact_degC,
+            "laboratory": lambda: plant.laboratory_degC,
+            "air": self._air_of_models_degC,
+        }
+        if not set(channels.values()) <= set(range(first, first + CHANNELS)):
+            raise ValueError(f"thermometer channels {dict(channels)}: expected {first}..{first + CHANNELS - 1}")
+        super().__init__(plant, clock, unit)
+        self.open_channels: set[int] = set()
+        self.shorted_channels: set[int] = set()
+        self.stuck_degC: dict[int, float] = {}
+        self.held_degC: dict[int, float] = {}
+        self.noisy_channel: int | None = None
+        self.offset_K: dict[int, float] = {}
+        self.drift_K_per_h: dict[int, float] = {}
+        self.pulled_out: set[int] = set()
+        self.air_exchanged = False
+        self.far_air_degC: Callable[[], float | None] = lambda: None  # where "air" hangs far from the camera
+        self._first = first
+        self._seed = seed
+        self._sensors = {number: places.get(name, self._air_degC) for name, number in channels.items()}
+        self._drifted_K: dict[int, float] = {}
+        self._loose_degC: dict[int, float] = {}  # of the sensors that hang in the laboratory
+        self._random = random.Random()
+        self._drawn_ns = 0
+        self._drawn: dict[int, float] = {}  # noise at that time by channel, in units of its standard deviation
+        plant.on_step.append(self._on_step)
+
+    def measured_degC(self, place: int) -> float:
+        """What the converter sees on the channel at that place of the module, 0 is the first: an open wire is far above
+        every range, a short far below."""
+        channel = self._first + place
+        if channel in self.open_channels or channel not in self._sensors:
+            return float("inf")
+        if channel in self.shorted_channels:
+            return float("-inf")
+        if channel in self.stuck_degC:
+            return self.stuck_degC[channel]
+        noise_K = self._noise(channel) * (NOISY_K if channel == self.noisy_channel else NOISE_K)
+        wrong_K = self.offset_K.get(channel, 0.0) + self._drifted_K.get(channel, 0.0)
+        felt_degC = self.held_degC.get(channel, self._loose_degC.get(channel, self._sensors[channel]()))
+        return felt_degC + noise_K + wrong_K
+
+    def _air_degC(self) -> float:
+        return self._plant.chamber_degC if self.air_exchanged else self._plant.air_degC
+
+    def _air_of_models_degC(self) -> float:
+        far_degC = self.far_air_degC()
+        return self._air_degC() if far_degC is None or self.air_exchanged else far_degC
+
+    def _noise(self, channel: int) -> float:
+        """Drawn once in a step of the plant: the values and the fault bits of a poll ask for it alike."""
+        if self._drawn_ns != self._plant.now_ns:
+            self._drawn_ns, self._drawn = self._plant.now_ns, {}
+        if channel not in self._drawn:
+            self._random.seed(f"{self._seed} {channel} {self._drawn_ns}")
+            self._drawn[channel] = self._random.gauss(0.0, 1.0)
+        return self._drawn[channel]
+
+    def _on_step(self, time_ns: int, dt_s: float) -> None:
+        for channel, rate_K_per_h in self.drift_K_per_h.items():
+            self._drifted_K[channel] = self._drifted_K.get(channel, 0.0) + rate_K_per_h * dt_s / 3600
+        if self.pulled_out or self._loose_degC:
+            self._loosen(dt_s)
+
+    def _loosen(self, dt_s: float) -> None:
+        """Sensors outside go to the laboratory's temperature, in still air; those put back are where they belong."""
+        loose, outside_degC = self._loose_degC, self._plant.laboratory_degC
+        was = {channel: loose.get(channel, self._sensors[channel]()) for channel in self.pulled_out}
+        self._loose_degC = {
+            channel: degC + (outside_degC - degC) * dt_s / STILL_AIR_LAG_S for channel, degC in was.items()
+        }
+
+
+def check_span(address: int, count: int, begin: int) -> None:
+    """Refusal outside of six addresses from `begin` on."""
+    if not begin <= address or address + count > begin + CHANNELS:
+        raise ModbusRefusal(ILLEGAL_ADDRESS)
+
 
 FAULT_BITS = 0x80
 FORMAT_COIL = 0x10C
@@ -53,7 +160,7 @@ class FakeThermometers(RtdModule):
     FC 0x46."""
 
     def __init__(
-        self, plant: Places, clock: Now, unit: int, channels: Mapping[str, int], seed: int, first: int = 0
+        self, plant: Plant, clock: Now, unit: int, channels: Mapping[str, int], seed: int, first: int = 0
     ) -> None:
         super().__init__(plant, clock, unit, channels, seed, first)
         self.name = M_7015
@@ -93,7 +200,7 @@ class FakeThermometers(RtdModule):
         """FC 02: a channel's bit is set when it is over or under its range or its wire is open."""
         check_span(address, count, FAULT_BITS)
         if self.no_fault_bits:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         present = [self._word(channel) in (OVER_RANGE, UNDER_RANGE) for channel in range(CHANNELS)]
         shown = self._fault_bits if self.late_fault_bit else present
         self._fault_bits = present
@@ -101,14 +208,14 @@ class FakeThermometers(RtdModule):
 
     def _read_coils(self, address: int, count: int) -> list[bool]:
         if address != FORMAT_COIL or count != 1:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         return [self._engineering]
 
     def _write_coil(self, address: int, value: int) -> bool:
         if address != FORMAT_COIL:
-            raise Refusal(ILLEGAL_ADDRESS)
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
         if value not in (COIL_ON, COIL_OFF):
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         self._engineering = value == COIL_ON
         return True
 
@@ -116,7 +223,7 @@ class FakeThermometers(RtdModule):
         if IDENTITY <= address < IDENTITY + 4:
             words = [each[at : at + 2] for each in (b"\0" + FIRMWARE, self.name) for at in (2, 0)]
             if address + count > IDENTITY + 4:
-                raise Refusal(ILLEGAL_ADDRESS)
+                raise ModbusRefusal(ILLEGAL_ADDRESS)
             return [int.from_bytes(word, "big") for word in words][address - IDENTITY :][:count]
         table, channel = self._table(address)
         check_span(channel, count, 0)
@@ -125,7 +232,7 @@ class FakeThermometers(RtdModule):
     def _write_register(self, address: int, value: int) -> bool:
         table, channel = self._table(address)
         if table is self.type_codes and value not in RANGES_DEGC:
-            raise Refusal(ILLEGAL_VALUE)
+            raise ModbusRefusal(ILLEGAL_VALUE)
         table[channel] = value
         return True
 
@@ -134,18 +241,73 @@ class FakeThermometers(RtdModule):
         for begin, table in ((TYPE_CODES, self.type_codes), (OFFSETS, self._register_offsets)):
             if begin <= address < begin + CHANNELS:
                 return table, address - begin
-        raise Refusal(ILLEGAL_ADDRESS)
+        raise ModbusRefusal(ILLEGAL_ADDRESS)
 
     def _identify(self, data: bytes) -> bytes:
         """FC 0x46, read name and read firmware version."""
         replies = {READ_NAME: self.name, READ_FIRMWARE: FIRMWARE}
         if len(data) != 1 or data[0] not in replies:
-            raise Refusal(ILLEGAL_FUNCTION)
+            raise ModbusRefusal(ILLEGAL_FUNCTION)
         return data + replies[data[0]]
 
 
 def _signed(word: int) -> int:
     return word - 0x10000 if word & 0x8000 else word
+
+
+# Advantech ADAM-4015: six RTD inputs over Modbus RTU.
+#
+# Values at 40001-40006 (function 3), 0..65535 linear over the range of the type code at 40201-40206; an open wire or
+# one above its range reads FFFF, one below 0000. Name at 40211-40212. The linear law and the name were not seen on a
+# module; type codes and the words out of range are of the ADAM-4000 manual.
+
+
+ADAM_VALUES, ADAM_TYPE_CODES, ADAM_NAME = 0, 200, 210  # 40001, 40201, 40211
+ADAM_4015 = (0x40, 0x15)
+ADAM_FULL_SCALE = 0xFFFF
+
+# Type code -> lowest and highest temperature, degC, for Pt100 (IEC).
+ADAM_RANGES_DEGC = {
+    0x20: (-50.0, 150.0),
+    0x21: (0.0, 100.0),
+    0x22: (0.0, 200.0),
+    0x23: (0.0, 400.0),
+    0x24: (-200.0, 200.0),
+}
+
+
+class FakeAdam4015(RtdModule):
+    """type_codes: range of each channel, written over the bus too. name: the two words that tell the module."""
+
+    def __init__(
+        self, plant: Plant, clock: Now, unit: int, channels: Mapping[str, int], seed: int, first: int = 0
+    ) -> None:
+        super().__init__(plant, clock, unit, channels, seed, first)
+        self.type_codes = [0x20] * CHANNELS
+        self.name = ADAM_4015
+        self.functions = {0x03: reads_words(self._read), 0x06: writes_one(self._write)}
+
+    def _read(self, address: int, count: int) -> list[int]:
+        if address >= ADAM_NAME:
+            if address + count > ADAM_NAME + len(self.name):
+                raise ModbusRefusal(ILLEGAL_ADDRESS)
+            return list(self.name[address - ADAM_NAME :][:count])
+        begin, table = (ADAM_TYPE_CODES, self.type_codes) if address >= ADAM_TYPE_CODES else (ADAM_VALUES, None)
+        check_span(address, count, begin)
+        places = range(address - begin, address - begin + count)
+        return [self._word(place) if table is None else table[place] for place in places]
+
+    def _word(self, place: int) -> int:
+        low_degC, high_degC = ADAM_RANGES_DEGC[self.type_codes[place]]
+        share = (self.measured_degC(place) - low_degC) / (high_degC - low_degC)
+        return round(min(max(share, 0.0), 1.0) * ADAM_FULL_SCALE)
+
+    def _write(self, address: int, value: int) -> bool:
+        check_span(address, 1, ADAM_TYPE_CODES)
+        if value not in ADAM_RANGES_DEGC:
+            raise ModbusRefusal(ILLEGAL_VALUE)
+        self.type_codes[address - ADAM_TYPE_CODES] = value
+        return True
 
 
 @fake("thermometer_module", rank=MEASURE)
