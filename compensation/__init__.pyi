@@ -1,7 +1,7 @@
 from thermostand.compensation.arrays import observations_of as observations_of
 from thermostand.compensation.arrays import states as states
 from thermostand.compensation.calibration.board import Board as Board
-from thermostand.compensation.calibration.calibrate import Calibration as Calibration
+from thermostand.compensation.calibration.calibrate import CameraCalibration as CameraCalibration
 from thermostand.compensation.calibration.calibrate import calibrate as calibrate
 from thermostand.compensation.calibration.camera_file import CameraFile as CameraFile
 from thermostand.compensation.calibration.camera_file import load_camera as load_camera

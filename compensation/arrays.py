@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermostand.compensation.history.states import Memory, States
-from thermostand.compensation.history.thermal_history import History, recorded_history, refined, states_at
+from thermostand.compensation.history.states import States, ThermalMemory
+from thermostand.compensation.history.thermal_history import ThermalHistory, recorded_history, refined, states_at
 from thermostand.compensation.observations import Float, Observations, SessionFacts
 from thermostand.compensation.one_camera import temperatures_at_frames
 from thermostand.compensation.sound_values import LARGEST_SIDE_px, check_centres, check_degC
@@ -67,7 +67,7 @@ class Remembering(Protocol):
     """A drift model."""
 
     @property
-    def memory(self) -> Memory:
+    def memory(self) -> ThermalMemory:
         """What has to be remembered for it."""
         ...
 
@@ -109,7 +109,7 @@ def states(
 
 def history_of(
     air: Column, supply: Column | None, camera: Column | None, time_ns: NDArray[np.int64], camera_degC: Float
-) -> History:
+) -> ThermalHistory:
     """What lags are computed from; ValueError when a column is none. A camera without `supply` is on, for it has
     temperatures, and without `camera` what it read at the frames is all that is known of its own."""
     frames = time_ns, camera_degC
@@ -118,7 +118,7 @@ def history_of(
         raise ValueError("supply: expected 0 (off) and 1 (on)")
     own = frames if camera is None else _column("camera", camera)
     measured = np.isfinite(own[1])
-    return refined(History(*_column("air", air), *powered, own[0][measured], own[1][measured]))
+    return refined(ThermalHistory(*_column("air", air), *powered, own[0][measured], own[1][measured]))
 
 
 def _column(name: str, given: Column) -> tuple[NDArray[np.int64], Float]:
@@ -406,7 +406,7 @@ def _size_of(centres_px: Float) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _air_at(history: History | None, time_ns: NDArray[np.int64]) -> Float:
+def _air_at(history: ThermalHistory | None, time_ns: NDArray[np.int64]) -> Float:
     """The air's temperature at these instants, NaN where it is not known."""
     if history is None:
         return np.full(len(time_ns), np.nan)

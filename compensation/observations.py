@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from thermostand.compensation.finding.finder import Finder
 from thermostand.compensation.finding.piece import FoundMarkers, joined, pieces_of
-from thermostand.compensation.history.thermal_history import History, recorded_history
+from thermostand.compensation.history.thermal_history import ThermalHistory, recorded_history
 from thermostand.compensation.one_camera import channel_of, own_frames, serial_of, take
 from thermostand.compensation.one_equilibrium import check_sessions
 from thermostand.experiments.steps import Role
@@ -92,7 +92,7 @@ class Observations:
     covariance_px2: Float
     flags: NDArray[np.uint8]
     reasons: tuple[str, ...]
-    histories: tuple[History, ...] = ()
+    histories: tuple[ThermalHistory, ...] = ()
 
     @property
     def usable(self) -> Mask:

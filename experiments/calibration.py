@@ -24,7 +24,7 @@ from thermostand.experiments.pieces import frames_at, homes_checked, moved, soak
 from thermostand.experiments.steps import CloseFlap, Role, StartChamber, Step, StopChamber
 
 
-class Calibration(MovingTable, Guaranteed):
+class CalibrationGrid(MovingTable, Guaranteed):
     """Parameters of a calibration."""
 
     reference_degC: Chamber_degC = 24.0
@@ -62,7 +62,7 @@ class Calibration(MovingTable, Guaranteed):
         return len(self.positions)
 
 
-def calibration(parameters: Calibration) -> Iterator[Step]:
+def calibration(parameters: CalibrationGrid) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped and the flap closed."""
     positions, reference_degC = parameters.positions, parameters.reference_degC
     yield CloseFlap()

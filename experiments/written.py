@@ -54,14 +54,14 @@ class Nothing(Document):
     """A step without parameters."""
 
 
-class Repeat(Document):
+class RepeatEntry(Document):
     """The same steps `times` times."""
 
     times: int = Field(ge=1, le=10_000)
     steps: StepEntries = Field(min_length=1)
 
 
-class Ramp(Document):
+class RampEntry(Document):
     """The set-point goes from where it is to `to_degC`, by `rate_K_per_min`: a new set-point every `every_K`, a soak
     that keeps the rate, then `steps`."""
 
@@ -127,8 +127,8 @@ def _writable() -> dict[str, type[Step]]:
 class StepEntry(Document):
     """One step, repeat or ramp."""
 
-    ramp: Ramp | None = None
-    repeat: Repeat | None = None
+    ramp: RampEntry | None = None
+    repeat: RepeatEntry | None = None
     _step: tuple[type[Step], object] | None = PrivateAttr(None)
 
     @model_validator(mode="wrap")
@@ -184,8 +184,8 @@ class StepEntry(Document):
 
 
 StepEntries = tuple[Annotated[StepEntry, BeforeValidator(_as_entry, json_schema_input_type=str | StepEntry)], ...]
-Repeat.model_rebuild()
-Ramp.model_rebuild()
+RepeatEntry.model_rebuild()
+RampEntry.model_rebuild()
 StepEntry.model_rebuild()
 
 

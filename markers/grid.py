@@ -20,7 +20,7 @@ from thermostand.foundation.errors import DetectionError
 from thermostand.markers.bootstrap import Candidates
 from thermostand.markers.lattice import largest_lattice
 from thermostand.markers.marks import with_marks
-from thermostand.markers.placement import LEAST_SEEN, Placement, placements, settled
+from thermostand.markers.placement import LEAST_SEEN, GridPlacement, placements, settled
 from thermostand.markers.plane import area_scale, expected_px, fit_homography, pitch_px, project, roll_deg
 from thermostand.markers.target import Target
 
@@ -98,8 +98,8 @@ def _too_few(found: int, target: Target) -> DetectionError:
 
 
 def _near_previous(
-    placements: list[Placement], points: Float, target: Target, previous: Float | None
-) -> list[Placement]:
+    placements: list[GridPlacement], points: Float, target: Target, previous: Float | None
+) -> list[GridPlacement]:
     """Those within half a pitch of where the frame before had the markers; all when there are none."""
     if previous is None:
         return placements
@@ -109,12 +109,12 @@ def _near_previous(
     return near or placements
 
 
-def _rms_distance(placement: Placement, points: Float, expected: Float) -> float:
+def _rms_distance(placement: GridPlacement, points: Float, expected: Float) -> float:
     seen = placement.candidate >= 0
     return float(np.sqrt(np.mean(np.sum((points[placement.candidate[seen]] - expected[seen]) ** 2, axis=1))))
 
 
-def _by_residual(placements: list[Placement], target: Target, shape: tuple[int, int] | None) -> list[Placement]:
+def _by_residual(placements: list[GridPlacement], target: Target, shape: tuple[int, int] | None) -> list[GridPlacement]:
     """The rotations of the best-fitting window; refuses when another window fits nearly as well."""
     placements = _beyond_the_frame(placements, target, shape) or placements
     best = min(placements, key=lambda p: p.residual_px)
@@ -130,12 +130,14 @@ def _by_residual(placements: list[Placement], target: Target, shape: tuple[int, 
     return same
 
 
-def _beyond_the_frame(placements: list[Placement], target: Target, shape: tuple[int, int] | None) -> list[Placement]:
+def _beyond_the_frame(
+    placements: list[GridPlacement], target: Target, shape: tuple[int, int] | None
+) -> list[GridPlacement]:
     """Those with missing markers, all of which are cut by the image's border or beyond it; none when one has all."""
     if shape is None or any(p.seen == target.count for p in placements):
         return []
     limits = np.array(shape[::-1]) - 1
-    chosen: list[Placement] = []
+    chosen: list[GridPlacement] = []
     for placement in placements:
         missing = placement.candidate < 0
         places = target.coordinates_mm()[missing]
@@ -146,7 +148,7 @@ def _beyond_the_frame(placements: list[Placement], target: Target, shape: tuple[
     return chosen
 
 
-def _same_window(one: Placement, other: Placement, target: Target) -> bool:
+def _same_window(one: GridPlacement, other: GridPlacement, target: Target) -> bool:
     """Whether two placements cover the same part of the image, however rotated: their corners coincide."""
     columns, rows = target.columns, target.rows
     corners = target.nominal_mm()[[0, columns - 1, columns * (rows - 1), columns * rows - 1]]
@@ -155,7 +157,7 @@ def _same_window(one: Placement, other: Placement, target: Target) -> bool:
     return bool(away.max() < 0.25 * pitch_px(one.homography, target))
 
 
-def _by_roll(placements: list[Placement], target: Target, previous: Float | None) -> Placement:
+def _by_roll(placements: list[GridPlacement], target: Target, previous: Float | None) -> GridPlacement:
     """The rotation nearest to the expected one; refuses when a second is about as near, or agrees with the marks."""
     if len(placements) > 1 and target.donut_markers is not None:
         raise DetectionError(f"too few of the donut markers of {target.name} are seen", placements[0].seen)
@@ -172,7 +174,7 @@ def _by_roll(placements: list[Placement], target: Target, previous: Float | None
     return best
 
 
-def _checked(chosen: Placement, points: Float, target: Target) -> Identified:
+def _checked(chosen: GridPlacement, points: Float, target: Target) -> Identified:
     """Without what lies off the place that the others give it: clutter in line with the grid."""
     candidate = settled(chosen.candidate, points, KDTree(points), target)
     kept = candidate >= 0

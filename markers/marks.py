@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thermostand.foundation.errors import DetectionError
 from thermostand.markers.bootstrap import Candidates
-from thermostand.markers.placement import Placement
+from thermostand.markers.placement import GridPlacement
 from thermostand.markers.plane import area_scale
 from thermostand.markers.target import DonutMarkers, OddMarker, Target
 
@@ -18,7 +18,7 @@ _MOST_WRONG = 1
 looks like a hole, dirt fills one. Another turn of the target has at least as many wrong as it puts marks elsewhere."""
 
 
-def with_marks(placements: list[Placement], candidates: Candidates, target: Target) -> list[Placement]:
+def with_marks(placements: list[GridPlacement], candidates: Candidates, target: Target) -> list[GridPlacement]:
     """Those placements that the marks agree with, all when the target has none. Raises DetectionError when there are
     none, and says when a mirror image would agree."""
     if target.odd_marker is not None:
@@ -29,12 +29,12 @@ def with_marks(placements: list[Placement], candidates: Candidates, target: Targ
 
 
 def _with_odd_marker(
-    placements: list[Placement], candidates: Candidates, target: Target, odd: OddMarker
-) -> list[Placement]:
+    placements: list[GridPlacement], candidates: Candidates, target: Target, odd: OddMarker
+) -> list[GridPlacement]:
     """Those with a disc of the odd size in the odd marker's place."""
     tolerance = 0.5 * abs(np.log(odd.diameter_mm / target.diameter_mm))
 
-    def agrees(placement: Placement) -> bool:
+    def agrees(placement: GridPlacement) -> bool:
         return bool(abs(np.log(_odd_size(placement, candidates, target, odd))) < tolerance)
 
     fitting = [p for p in placements if agrees(p)]
@@ -45,8 +45,8 @@ def _with_odd_marker(
 
 
 def _with_donuts(
-    placements: list[Placement], candidates: Candidates, target: Target, donuts: DonutMarkers
-) -> list[Placement]:
+    placements: list[GridPlacement], candidates: Candidates, target: Target, donuts: DonutMarkers
+) -> list[GridPlacement]:
     """Those whose holes are where they should be, with the fewest wrong ones."""
     wrong = [_wrong_holes(p, candidates, target) for p in placements]
     if min(wrong) <= _MOST_WRONG:
@@ -58,7 +58,7 @@ def _with_donuts(
     raise _refusal(placements, target, name, mirrored=mirrored <= _MOST_WRONG)
 
 
-def _refusal(placements: list[Placement], target: Target, marks: str, *, mirrored: bool) -> DetectionError:
+def _refusal(placements: list[GridPlacement], target: Target, marks: str, *, mirrored: bool) -> DetectionError:
     found = max(p.seen for p in placements)
     if mirrored:
         return DetectionError(
@@ -69,7 +69,7 @@ def _refusal(placements: list[Placement], target: Target, marks: str, *, mirrore
     return DetectionError(f"found {found} of {target.count} markers of {target.name}, but not the {marks}", found)
 
 
-def _mirrored(placement: Placement, target: Target) -> list[Placement]:
+def _mirrored(placement: GridPlacement, target: Target) -> list[GridPlacement]:
     """The placements of a mirrored target."""
     return [
         replace(placement, candidate=placement.candidate[places])
@@ -78,7 +78,7 @@ def _mirrored(placement: Placement, target: Target) -> list[Placement]:
     ]
 
 
-def _odd_size(placement: Placement, candidates: Candidates, target: Target, odd: OddMarker) -> float:
+def _odd_size(placement: GridPlacement, candidates: Candidates, target: Target, odd: OddMarker) -> float:
     """Diameter of the disc in the odd marker's place over the expected one; the other markers give the scale."""
     seen, index = placement.candidate >= 0, odd.number - 1
     if not seen[index]:
@@ -88,7 +88,7 @@ def _odd_size(placement: Placement, candidates: Candidates, target: Target, odd:
     return float(size[index] / np.median(size[seen]))
 
 
-def _wrong_holes(placement: Placement, candidates: Candidates, target: Target) -> int:
+def _wrong_holes(placement: GridPlacement, candidates: Candidates, target: Target) -> int:
     """How many markers have a hole that should have none, or none that should have one; marks that are not seen count
     as well."""
     seen, donut = placement.candidate >= 0, target.is_donut()

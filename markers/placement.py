@@ -34,7 +34,7 @@ Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placement:
+class GridPlacement:
     """One way to lay the target over the lattice. candidate: (N,) of each marker, -1 for none. homography: target mm
     -> px. residual_px: root mean square over the markers seen, and half a pixel for each that is missing.
     """
@@ -49,7 +49,7 @@ class Placement:
         return int((self.candidate >= 0).sum())
 
 
-def placements(lattice: dict[Cell, int], points: Float, target: Target) -> list[Placement]:
+def placements(lattice: dict[Cell, int], points: Float, target: Target) -> list[GridPlacement]:
     """All placements with at most two markers fewer than the best, in all rotations; gaps and misfits settled."""
     cells: Index = np.array(list(lattice.keys()), dtype=np.intp)
     members: Index = np.array(list(lattice.values()), dtype=np.intp)
@@ -65,9 +65,9 @@ def placements(lattice: dict[Cell, int], points: Float, target: Target) -> list[
     return _placed(_fullest(_distinct(tables)), points, target)
 
 
-def _placed(tables: list[Index], points: Float, target: Target) -> list[Placement]:
+def _placed(tables: list[Index], points: Float, target: Target) -> list[GridPlacement]:
     """The placements of those tables that are the image of a flat target at all."""
-    possible: list[Placement] = []
+    possible: list[GridPlacement] = []
     for table in tables:
         with suppress(DetectionError):
             possible.append(placement(table, points, target))
@@ -116,14 +116,14 @@ def _fullest(tables: list[Index]) -> list[Index]:
     return [table for table in tables if _seen(table) >= max(LEAST_SEEN, most - _FEWER_THAN_BEST)]
 
 
-def placement(candidate: Index, points: Float, target: Target) -> Placement:
+def placement(candidate: Index, points: Float, target: Target) -> GridPlacement:
     """The homography of a table marker -> candidate, and how well it fits."""
     seen = candidate >= 0
     target_mm, centres_px = target.coordinates_mm()[seen], points[candidate[seen]]
     homography = fit_homography(target_mm, centres_px)
     off = np.linalg.norm(project(homography, target_mm) - centres_px, axis=1)
     missing = len(candidate) - int(seen.sum())
-    return Placement(candidate, homography, float(np.sqrt(np.mean(off**2))) + _MISSING_PX * missing)
+    return GridPlacement(candidate, homography, float(np.sqrt(np.mean(off**2))) + _MISSING_PX * missing)
 
 
 def settled(candidate: Index, points: Float, tree: KDTree, target: Target) -> Index:

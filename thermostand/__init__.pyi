@@ -1,5 +1,5 @@
 from thermostand.compensation import Board as Board
-from thermostand.compensation import Calibration as Calibration
+from thermostand.compensation import CameraCalibration as CameraCalibration
 from thermostand.compensation import CameraFile as CameraFile
 from thermostand.compensation import DriftModel as DriftModel
 from thermostand.compensation import Evaluation as Evaluation

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.budget.geometry import Geometry, Quantity, StandTemperatures
+from thermostand.compensation.budget.geometry import Geometry, StandState, UncertainValue
 from thermostand.compensation.one_camera import channel_of
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE
@@ -19,7 +19,7 @@ from thermostand.markers.target import Target
 from thermostand.recording.reading.interpolation import interpolated
 from thermostand.recording.reading.session import Session
 
-_SENSORS = tuple(name.removesuffix("_degC") for name in StandTemperatures.__dataclass_fields__)
+_SENSORS = tuple(name.removesuffix("_degC") for name in StandState.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,25 +31,25 @@ class CaptureState:
     chamber_degC: float
     start_ns: int
     end_ns: int
-    state: StandTemperatures
+    state: StandState
 
 
-def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[StandTemperatures]:
+def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[StandState]:
     """The thermometers at each instant; NaN where one was BAD or silent for more than two minutes.
 
     SessionError when the session has no such thermometer.
     """
     columns = [interpolated(*session.readings(f"thermometers.{sensor}"), times_ns) for sensor in _SENSORS]
-    return [StandTemperatures(*map(float, row)) for row in np.stack(columns, axis=1)]
+    return [StandState(*map(float, row)) for row in np.stack(columns, axis=1)]
 
 
-def mean_state(states: Sequence[StandTemperatures]) -> StandTemperatures:
+def mean_state(states: Sequence[StandState]) -> StandState:
     """The mean of each thermometer over the states that know it; NaN when none does."""
     table = np.array([[getattr(state, f"{sensor}_degC") for sensor in _SENSORS] for state in states])
     known = np.isfinite(table)
     counts = np.maximum(known.sum(axis=0), 1)
     means = np.where(known.any(axis=0), np.where(known, table, 0.0).sum(axis=0) / counts, math.nan)
-    return StandTemperatures(*map(float, means))
+    return StandState(*map(float, means))
 
 
 def capture_states(session: Session) -> list[CaptureState]:
@@ -223,7 +223,7 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
 
 
-def displacement_px(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry, xy_px: Float) -> Float:
+def displacement_px(state: StandState, reference: StandState, geometry: Geometry, xy_px: Float) -> Float:
     """The displacement of image points (..., 2) by granite, post, target and air, from `reference` to `state`."""
     centre = (np.array(geometry.image_px) - 1) / 2
     offset = np.asarray(xy_px, dtype=np.float64) - centre
@@ -237,19 +237,19 @@ def displacement_px(state: StandTemperatures, reference: StandTemperatures, geom
     return scale * offset + post * down + refraction
 
 
-def varied(state: StandTemperatures, geometry: Geometry) -> Iterator[tuple[StandTemperatures, Geometry]]:
+def varied(state: StandState, geometry: Geometry) -> Iterator[tuple[StandState, Geometry]]:
     """State and geometry with one uncertain input after the other larger by its standard uncertainty."""
     for name in Geometry.model_fields:
         quantity = getattr(geometry, name)
-        if isinstance(quantity, Quantity) and quantity.u > 0:
-            larger = Quantity(value=quantity.value + quantity.u, u=quantity.u)
+        if isinstance(quantity, UncertainValue) and quantity.u > 0:
+            larger = UncertainValue(value=quantity.value + quantity.u, u=quantity.u)
             yield state, geometry.model_copy(update={name: larger})
-    for field in fields(StandTemperatures):
+    for field in fields(StandState):
         on_granite = geometry.granite_gradient_K if field.name.startswith("granite") else 0.0
         yield state.warmer_by(**{field.name: math.hypot(geometry.thermometer_K, on_granite)}), geometry
 
 
-def granite_mm(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
+def granite_mm(state: StandState, reference: StandState, geometry: Geometry) -> float:
     """How much the base has moved the target away from the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     outside_K = state.granite_outside_degC - reference.granite_outside_degC
@@ -257,24 +257,24 @@ def granite_mm(state: StandTemperatures, reference: StandTemperatures, geometry:
     return geometry.granite_per_K.value * lengths_mm_K
 
 
-def post_mm(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
+def post_mm(state: StandState, reference: StandState, geometry: Geometry) -> float:
     """How much the post has lifted the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     return geometry.granite_per_K.value * geometry.post_mm.value * inside_K
 
 
-def target_strain(state: StandTemperatures, reference: StandTemperatures, geometry: Geometry) -> float:
+def target_strain(state: StandState, reference: StandState, geometry: Geometry) -> float:
     """Relative growth of the target."""
     return geometry.target_per_K.value * (state.artifact_degC - reference.artifact_degC)
 
 
-def refraction_px(state: StandTemperatures, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
+def refraction_px(state: StandState, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
     """How far points (..., 2), px from the principal point, appear outwards by the air's indices on both sides."""
     n1, n2 = indices(state, geometry, index)
     return appears_px(offset_px, geometry.focal_px, geometry.distance_mm.value, geometry.interface_mm.value, n1, n2)
 
 
-def indices(state: StandTemperatures, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
+def indices(state: StandState, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
     """Refractive indices of the air at the camera and of the laboratory's."""
     pressure_Pa = geometry.pressure_Pa.value
     laboratory_Pa = geometry.relative_humidity.value * saturation_Pa(state.laboratory_degC)
@@ -283,12 +283,12 @@ def indices(state: StandTemperatures, geometry: Geometry, index: Index = ciddor_
     return n1, 1 + index(state.laboratory_degC, pressure_Pa, laboratory_Pa, geometry.wavelength_um)
 
 
-Effect = Callable[[StandTemperatures, Geometry], tuple[float, float]]
+Effect = Callable[[StandState, Geometry], tuple[float, float]]
 """(state, geometry) -> (um on or of the target, px in the image)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Contribution:
+class BudgetLine:
     """One line. um, px: at its largest over the session's captures, with sign. u_um, u_px: their standard
     uncertainties; NaN for a scatter, which is one itself. where: the place in the image. corrected: whether
     correction.py takes it out, so that only the uncertainty stays.
@@ -307,9 +307,9 @@ class Contribution:
 class Budget:
     """A session's contributions against its reference state; coolest and warmest air at the camera during captures."""
 
-    reference: StandTemperatures
+    reference: StandState
     air_degC: tuple[float, float]
-    contributions: tuple[Contribution, ...]
+    contributions: tuple[BudgetLine, ...]
 
 
 def budget(session: Session, target: Target, geometry: Geometry) -> Budget:
@@ -353,32 +353,32 @@ def table(budget: Budget) -> str:
 
 
 def _thermal(
-    states: Sequence[StandTemperatures], reference: StandTemperatures, geometry: Geometry, radius_mm: float
-) -> list[Contribution]:
+    states: Sequence[StandState], reference: StandState, geometry: Geometry, radius_mm: float
+) -> list[BudgetLine]:
     um_per_px = 1e3 * geometry.distance_mm.value / geometry.focal_px
     corner_px = np.array([(geometry.image_px[0] - 1) / 2, (geometry.image_px[1] - 1) / 2])
 
-    def granite(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
+    def granite(state: StandState, stand: Geometry) -> tuple[float, float]:
         away_mm = granite_mm(state, reference, stand)
         return 1e3 * away_mm, -away_mm / stand.distance_mm.value * float(np.linalg.norm(corner_px))
 
-    def post(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
+    def post(state: StandState, stand: Geometry) -> tuple[float, float]:
         up_mm = post_mm(state, reference, stand)
         return 1e3 * up_mm, up_mm * stand.focal_px / stand.distance_mm.value
 
-    def growth(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
+    def growth(state: StandState, stand: Geometry) -> tuple[float, float]:
         outwards_mm = target_strain(state, reference, stand) * radius_mm
         return 1e3 * outwards_mm, outwards_mm * stand.focal_px / stand.distance_mm.value
 
     def refraction(index: Index) -> Effect:
-        def of(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
+        def of(state: StandState, stand: Geometry) -> tuple[float, float]:
             moved = refraction_px(state, stand, corner_px, index) - refraction_px(reference, stand, corner_px, index)
             outwards_px = float(np.sign(moved[0]) * np.linalg.norm(moved))
             return outwards_px * um_per_px, outwards_px
 
         return of
 
-    def tilted(state: StandTemperatures, stand: Geometry) -> tuple[float, float]:
+    def tilted(state: StandState, stand: Geometry) -> tuple[float, float]:
         tilt_rad, interface_mm = math.radians(stand.interface_tilt_deg), stand.interface_mm.value
         now, before = (
             tilted_shift_mm(tilt_rad, stand.distance_mm.value, interface_mm, *indices(at, stand))
@@ -405,36 +405,36 @@ def _thermal(
 def _largest(
     name: str,
     effect: Effect,
-    states: Sequence[StandTemperatures],
+    states: Sequence[StandState],
     geometry: Geometry,
     where: str,
     corrected: bool = False,
-) -> Contribution:
+) -> BudgetLine:
     """The effect in the state where it is largest; uncertainty by varying every uncertain input."""
     state = max(states, key=lambda at: abs(effect(at, geometry)[1]))
     nominal = np.array(effect(state, geometry))
     off = [np.array(effect(*inputs)) - nominal for inputs in varied(state, geometry)]
     u_um, u_px = np.sqrt(np.sum(np.square(off), axis=0))
-    return Contribution(name, float(nominal[0]), float(u_um), float(nominal[1]), float(u_px), where, corrected)
+    return BudgetLine(name, float(nominal[0]), float(u_um), float(nominal[1]), float(u_px), where, corrected)
 
 
-def _linear(name: str, away_mm: float, target: Target, geometry: Geometry) -> Contribution:
+def _linear(name: str, away_mm: float, target: Target, geometry: Geometry) -> BudgetLine:
     """A table that is `away_mm` too far: a scale."""
     distance_mm, radius_mm = geometry.distance_mm.value, _outermost_mm(target)
     px = away_mm / distance_mm * radius_mm / distance_mm * geometry.focal_px
-    return Contribution(name, 1e3 * away_mm, math.nan, px, math.nan, "the outermost marker", False)
+    return BudgetLine(name, 1e3 * away_mm, math.nan, px, math.nan, "the outermost marker", False)
 
 
-def _rotary(name: str, turned_deg: float, target: Target, geometry: Geometry) -> Contribution:
+def _rotary(name: str, turned_deg: float, target: Target, geometry: Geometry) -> BudgetLine:
     """A table that is turned: the target's edge comes nearer by r phi, and its image moves outwards."""
     distance_mm, radius_mm = geometry.distance_mm.value, _outermost_mm(target)
     nearer_mm = radius_mm * math.radians(turned_deg)
     px = nearer_mm / distance_mm * radius_mm / distance_mm * geometry.focal_px
-    return Contribution(name, 1e3 * nearer_mm, math.nan, px, math.nan, "the outermost marker", False)
+    return BudgetLine(name, 1e3 * nearer_mm, math.nan, px, math.nan, "the outermost marker", False)
 
 
-def _homes(linear: Repeatability, rotary: Repeatability, target: Target, geometry: Geometry) -> list[Contribution]:
-    found: list[Contribution] = []
+def _homes(linear: Repeatability, rotary: Repeatability, target: Target, geometry: Geometry) -> list[BudgetLine]:
+    found: list[BudgetLine] = []
     if linear.count:
         found.append(_linear(f"linear table, {linear.count} home checks", linear.rms, target, geometry))
     if rotary.count:
@@ -442,12 +442,12 @@ def _homes(linear: Repeatability, rotary: Repeatability, target: Target, geometr
     return found
 
 
-def _repeats(repeats: Repeatability, geometry: Geometry) -> list[Contribution]:
+def _repeats(repeats: Repeatability, geometry: Geometry) -> list[BudgetLine]:
     if not repeats.count:
         return []
     um = 1e3 * repeats.rms * geometry.distance_mm.value / geometry.focal_px
     name = f"V0 seen again, {repeats.count} times, with the camera"
-    return [Contribution(name, um, math.nan, repeats.rms, math.nan, "per coordinate", False)]
+    return [BudgetLine(name, um, math.nan, repeats.rms, math.nan, "per coordinate", False)]
 
 
 def _outermost_mm(target: Target) -> float:
@@ -456,8 +456,8 @@ def _outermost_mm(target: Target) -> float:
     return float(np.linalg.norm(places - (places.min(axis=0) + places.max(axis=0)) / 2, axis=1).max())
 
 
-def _is_known(state: StandTemperatures) -> bool:
-    return all(math.isfinite(getattr(state, name)) for name in StandTemperatures.__dataclass_fields__)
+def _is_known(state: StandState) -> bool:
+    return all(math.isfinite(getattr(state, name)) for name in StandState.__dataclass_fields__)
 
 
 def _number(value: float, width: int, digits: int) -> str:

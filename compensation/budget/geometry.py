@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from thermostand.foundation.documents import Document, load_document
 
 
-class Quantity(Document):
+class UncertainValue(Document):
     """A value and its standard uncertainty `u`, in the unit that the key names."""
 
     value: float
@@ -31,15 +31,15 @@ class Geometry(Document):
     """
 
     name: str
-    distance_mm: Quantity
-    granite_inside_mm: Quantity
-    granite_outside_mm: Quantity
-    post_mm: Quantity
-    interface_mm: Quantity
-    granite_per_K: Quantity
-    target_per_K: Quantity
-    pressure_Pa: Quantity
-    relative_humidity: Quantity
+    distance_mm: UncertainValue
+    granite_inside_mm: UncertainValue
+    granite_outside_mm: UncertainValue
+    post_mm: UncertainValue
+    interface_mm: UncertainValue
+    granite_per_K: UncertainValue
+    target_per_K: UncertainValue
+    pressure_Pa: UncertainValue
+    relative_humidity: UncertainValue
     wavelength_um: Annotated[float, Field(ge=0.35, le=1.7)]
     thermometer_K: Annotated[float, Field(ge=0)]
     granite_gradient_K: Annotated[float, Field(ge=0)]
@@ -65,7 +65,7 @@ class Geometry(Document):
 
 
 @dataclass(frozen=True, slots=True)
-class StandTemperatures:
+class StandState:
     """The five thermometers at an instant, or the mean of a while, degC."""
 
     granite_inside_degC: float
@@ -74,7 +74,7 @@ class StandTemperatures:
     air_degC: float
     laboratory_degC: float
 
-    def warmer_by(self, **change_K: float) -> StandTemperatures:
+    def warmer_by(self, **change_K: float) -> StandState:
         """The state with some thermometers (field names) changed by so many K."""
         return replace(self, **{name: getattr(self, name) + change for name, change in change_K.items()})
 

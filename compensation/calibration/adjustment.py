@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.bundle import Scene, problem_of
+from thermostand.compensation.calibration.bundle import TableScene, problem_of
 from thermostand.compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from thermostand.compensation.calibration.least_squares import (
     Float,
@@ -20,7 +20,7 @@ from thermostand.compensation.calibration.least_squares import (
 )
 from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv
 from thermostand.compensation.calibration.session_centres import Positions
-from thermostand.compensation.calibration.stage_geometry import ERRORS, Table, TableSigma
+from thermostand.compensation.calibration.stage_geometry import ERRORS, TableGeometry, TableSigma
 from thermostand.compensation.drift.hull import convex_hull
 from thermostand.foundation.errors import CalibrationError
 
@@ -30,7 +30,7 @@ _LEAST_TRAVEL_MM = 10.0
 
 def table_from_poses(
     linear_mm: Float, rotary_deg: Float, rotations: Float, translations_mm: Float, middle_mm: Float
-) -> Table:
+) -> TableGeometry:
     """The table that puts the target, whose middle is (3,), at poses (P, 3, 3) and (P, 3).
 
     CalibrationError when an axis hardly moved.
@@ -46,7 +46,7 @@ def table_from_poses(
     base_mm, linear, offset_mm = _places(linear_mm, turns.as_matrix(), translations_mm)
     # What of o is along the axis is for the wobble to act on, and otherwise the same as a shift of the base.
     along = rotary * (rotary @ (offset_mm + mount @ middle_mm))
-    return Table(base_mm + along, linear, rotary, mount, offset_mm - along)
+    return TableGeometry(base_mm + along, linear, rotary, mount, offset_mm - along)
 
 
 def _axis(rotary_deg: Float, rotations: Float) -> Float:
@@ -83,7 +83,7 @@ class Adjustment:
     beyond noise and priors; 0 when they explain all. chi: of all residuals, the discrepancy not counted as noise.
     """
 
-    scene: Scene
+    scene: TableScene
     board: Board
     sigma: TableSigma
     freed: NDArray[np.bool_]
@@ -139,7 +139,7 @@ class _Round:
     """One adjustment with fixed eccentricities, markers and discrepancy. excess: squares over their
     expectation, 1 when all is explained."""
 
-    solution: Solution[Scene]
+    solution: Solution[TableScene]
     shifts_px: Float
     used: NDArray[np.bool_]
     discrepancy_px: float
@@ -154,7 +154,7 @@ class _Round:
 class Start:
     """Where an adjustment begins: Brown's camera and the table, with the corrections (P, N, 2), px, by homographies."""
 
-    scene: Scene
+    scene: TableScene
     shifts_px: Float
 
 
@@ -196,7 +196,7 @@ def adjust(
 
 
 def _adjusted(
-    start: Scene,
+    start: TableScene,
     positions: Positions,
     board: Board,
     sigma: TableSigma,
@@ -224,7 +224,7 @@ def _adjusted(
     )
 
 
-def _board_excess(solution: Solution[Scene], board: Board) -> float:
+def _board_excess(solution: Solution[TableScene], board: Board) -> float:
     """Squared corrections of the board in its plane over what its prior allows, less three standard errors.
 
     A lens that the model cannot follow bends the board before it shows in the residuals.
@@ -245,10 +245,10 @@ def start_of(positions: Positions, board: Board) -> Start:
     table = table_from_poses(
         positions.linear_mm, positions.rotary_deg, start.rotations, start.translations_mm, board.points_mm.mean(axis=0)
     )
-    return Start(Scene(start.lens, table, np.zeros((len(centres), ERRORS)), board.points_mm), shifts)
+    return Start(TableScene(start.lens, table, np.zeros((len(centres), ERRORS)), board.points_mm), shifts)
 
 
-def _residuals(scene: Scene, positions: Positions, shifts_px: Float) -> Float:
+def _residuals(scene: TableScene, positions: Positions, shifts_px: Float) -> Float:
     """(P, N, 2): computed minus measured centres, px; NaN without a centre."""
     rotations, translations = scene.table.poses(positions.linear_mm, positions.rotary_deg, scene.errors)
     seen = np.einsum("pij,nj->pni", rotations, scene.points_mm) + translations[:, None]

@@ -19,7 +19,7 @@ from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.least_squares import Float, whiteners
 from thermostand.compensation.calibration.pinhole import Pinhole
 from thermostand.compensation.calibration.session_centres import Positions
-from thermostand.compensation.calibration.stage_geometry import PARAMETERS, Table, TableSigma
+from thermostand.compensation.calibration.stage_geometry import PARAMETERS, TableGeometry, TableSigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,11 +80,11 @@ _LENS_ORDERS = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class TableScene:
     """Camera, table, its errors (P, 6) in mm and rad, and board points (N, 3), mm: what the adjustment looks for."""
 
     lens: Pinhole
-    table: Table
+    table: TableGeometry
     errors: Float
     points_mm: Float
 
@@ -111,7 +111,7 @@ class Problem:
         errors = int(self.freed.sum()) * len(self.linear_mm)
         return 2 * len(self.position) + len(self.lens_sigma) + errors + self.prior_mm.size
 
-    def residuals(self, scene: Scene) -> Float:
+    def residuals(self, scene: TableScene) -> Float:
         """(count,): markers (x, y each), distortion, table errors, board; all of unit variance."""
         seen = _seen_points(scene, self)
         off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(seen) - self.centres_px)
@@ -124,7 +124,7 @@ class Problem:
             ]
         )
 
-    def slopes(self, scene: Scene) -> Slopes:
+    def slopes(self, scene: TableScene) -> Slopes:
         """Derivatives of the markers' residuals."""
         points = scene.points_mm[self.marker]
         seen = _seen_points(scene, self)
@@ -140,7 +140,7 @@ class Problem:
             by_point @ to_points,
         )
 
-    def equations(self, scene: Scene, residuals: Float) -> tuple[Float, Float]:
+    def equations(self, scene: TableScene, residuals: Float) -> tuple[Float, Float]:
         """Normal matrix (n, n) and gradient (n,) of a step of camera, table, free table errors and board points."""
         off = residuals[: 2 * len(self.position)].reshape(-1, 2)
         normal, gradient = equations_of(self.slopes(scene), off, len(self.linear_mm), len(self.prior_mm))
@@ -152,13 +152,13 @@ class Problem:
         gradient[known] += weights * residuals[off.size :]
         return normal, gradient
 
-    def stepped(self, scene: Scene, change: Float) -> Scene:
+    def stepped(self, scene: TableScene, change: Float) -> TableScene:
         """The scene a step (n,) away."""
         lens, free = len(scene.lens.vector), int(self.freed.sum())
         first_point = len(change) - scene.points_mm.size
         errors = scene.errors.copy()
         errors[:, self.freed] += change[lens + PARAMETERS : first_point].reshape(-1, free)
-        return Scene(
+        return TableScene(
             scene.lens.stepped(change[:lens]),
             scene.table.stepped(change[lens : lens + PARAMETERS]),
             errors,
@@ -195,7 +195,7 @@ def problem_of(
     )
 
 
-def _seen_points(scene: Scene, problem: Problem) -> Float:
+def _seen_points(scene: TableScene, problem: Problem) -> Float:
     """(M, 3): the used markers in the camera's frame, mm."""
     rotations, translations = scene.table.poses(problem.linear_mm, problem.rotary_deg, scene.errors)
     points = scene.points_mm[problem.marker]

@@ -24,7 +24,7 @@ from thermostand.compensation.calibration.model_scores import (
 from thermostand.compensation.calibration.rays import DEGREES, RayLens
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma
-from thermostand.compensation.calibration.uncertainty import Difference, UncertaintyMap, projection_uncertainty
+from thermostand.compensation.calibration.uncertainty import CameraDifference, UncertaintyMap, projection_uncertainty
 from thermostand.markers.target import Target
 
 
@@ -43,7 +43,7 @@ are a weaker sign: of one lens they were 1.51 times, where held-out positions sa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
+class CameraCalibration:
     """The result. scores: of all models at held-out positions, none when too few are left to tell. model: the pinhole
     in use. uncertainty, halves: at the mean distance of the target; halves is None when one of them determines no
     camera. not_known: of scores and halves, why they are not known. rays_times: what the rays leave over what the
@@ -54,7 +54,7 @@ class Calibration:
     scores: tuple[ModelScore, ...]
     model: str
     uncertainty: UncertaintyMap
-    halves: Difference | None
+    halves: CameraDifference | None
     not_known: tuple[str, ...] = ()
     rays_times: float = 1.0
 
@@ -75,7 +75,7 @@ class Calibration:
 
 def calibrate(
     positions: Positions, target: Target, sigma: TableSigma | None = None, model: Model = Model.AUTO
-) -> Calibration:
+) -> CameraCalibration:
     """Adjust, choose pinhole and degree of the rays by held-out positions, and compare the session's halves.
 
     Without scores the pinhole is Brown's unless `model` says otherwise, and the rays are of the lowest degree.
@@ -92,7 +92,7 @@ def calibrate(
     distance_mm = float(np.mean(adjustment.poses()[1][:, 2]))
     apart, no_halves = known_or_why(lambda: halves(positions, board, sigma, distance_mm, rational=chosen == RATIONAL))
     checks = {"how well held-out positions are met": no_scores, "by how much the halves differ": no_halves}
-    return Calibration(
+    return CameraCalibration(
         adjustment=adjustment,
         rays=rays,
         scores=scores,

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from thermostand.compensation.calibration.adjustment import Adjustment
 from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.calibrate import Calibration
+from thermostand.compensation.calibration.calibrate import CameraCalibration
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.pinhole import NAMES, Pinhole
 from thermostand.compensation.calibration.rays import RayLens, exponents
@@ -248,7 +248,7 @@ def load_camera(path: Path | str) -> CameraFile:
 
 
 def camera_file(
-    calibration: Calibration,
+    calibration: CameraCalibration,
     *,
     camera_serial: str,
     session_ids: tuple[str, ...],
@@ -282,7 +282,7 @@ def camera_file(
     return CameraFile.model_validate(plain(document))
 
 
-def _fit(calibration: Calibration) -> dict[str, object]:
+def _fit(calibration: CameraCalibration) -> dict[str, object]:
     adjustment = calibration.adjustment
     return {
         "rms_px": adjustment.rms_px,
@@ -317,7 +317,7 @@ def _rays(rays: RayLens) -> dict[str, object]:
     }
 
 
-def _uncertainty(calibration: Calibration) -> dict[str, object]:
+def _uncertainty(calibration: CameraCalibration) -> dict[str, object]:
     found = calibration.uncertainty
     return {
         "distance_mm": found.distance_mm,

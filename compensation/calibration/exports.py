@@ -23,7 +23,7 @@ _GRID_COLUMNS = 33
 
 
 @dataclass(frozen=True, slots=True)
-class Refit:
+class RadtanFit:
     """A lens fitted to another one over the whole image; rms_px per coordinate, worst_px: the longest difference."""
 
     lens: Pinhole
@@ -31,7 +31,7 @@ class Refit:
     worst_px: float
 
 
-def refit_radtan(lens: Pinhole) -> Refit:
+def refit_radtan(lens: Pinhole) -> RadtanFit:
     """The nearest camera with k1 k2 p1 p2 only, by least squares over the pixels of the image.
 
     A rational denominator and k3 go into k1, k2 and the focal lengths, not away.
@@ -52,7 +52,7 @@ def refit_radtan(lens: Pinhole) -> Refit:
         step,
     )
     off = solution.state.project(points) - pixels[kept]
-    return Refit(solution.state, float(np.sqrt(np.mean(off**2))), float(np.linalg.norm(off, axis=1).max()))
+    return RadtanFit(solution.state, float(np.sqrt(np.mean(off**2))), float(np.linalg.norm(off, axis=1).max()))
 
 
 def opencv_yaml(lens: Pinhole, name: str, rms_px: float) -> str:

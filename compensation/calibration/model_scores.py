@@ -16,7 +16,7 @@ from thermostand.compensation.calibration.pose import Lens, find_pose
 from thermostand.compensation.calibration.rays import DEGREES, RayLens, fit_rays
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma
-from thermostand.compensation.calibration.uncertainty import Difference, difference
+from thermostand.compensation.calibration.uncertainty import CameraDifference, difference
 from thermostand.foundation.errors import CalibrationError
 
 BROWN, RATIONAL = "pinhole, Brown", "pinhole, rational"
@@ -86,7 +86,9 @@ def best(scores: tuple[ModelScore, ...]) -> str:
     return next(score.model for score in scores if score.rms_px <= lowest.rms_px + lowest.sigma_px)
 
 
-def halves(positions: Positions, board: Board, sigma: TableSigma, distance_mm: float, *, rational: bool) -> Difference:
+def halves(
+    positions: Positions, board: Board, sigma: TableSigma, distance_mm: float, *, rational: bool
+) -> CameraDifference:
     """What the calibrations from every other position and from the rest say differently."""
     odd = np.arange(len(positions.linear_mm)) % 2 == 1
     first, second = (adjust(positions.part(chosen), board, sigma, rational=rational) for chosen in (~odd, odd))

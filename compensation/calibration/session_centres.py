@@ -65,7 +65,7 @@ _END_NS = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, slots=True)
-class Visit:
+class TableVisit:
     """A capture: where the axes (linear mm, rotary deg) were sent, when they came to rest and when they moved on."""
 
     role: str
@@ -74,12 +74,12 @@ class Visit:
     until_ns: dict[str, int]
 
 
-def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, Visit]:
+def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, TableVisit]:
     """Step id -> visit of the captures with one of these roles, in order; SessionError when an axis was not moved
     before one."""
     sent: dict[str, float] = {}
     since_ns: dict[str, int] = {}
-    visits: dict[str, Visit] = {}
+    visits: dict[str, TableVisit] = {}
     for mark in steps:
         if mark.kind == "move_to":
             axis = str(mark.parameters.get("axis"))
@@ -92,11 +92,11 @@ def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, V
             role = str(mark.parameters["role"])
             if not all(axis in sent for axis in AXES):
                 raise SessionError(f"step {mark.index + 1}: a {role} capture, but no move of both axes before it")
-            visits[mark.step_id] = Visit(role, dict(sent), dict(since_ns), {})
+            visits[mark.step_id] = TableVisit(role, dict(sent), dict(since_ns), {})
     return visits
 
 
-def place(session: Session, axis: Axis, visit: Visit) -> float:
+def place(session: Session, axis: Axis, visit: TableVisit) -> float:
     """Mean of what the axis reported at rest during the visit, else where it was sent; mm or deg."""
     try:
         times_ns, values = session.readings(f"{axis}.position")

@@ -47,7 +47,7 @@ class TableSigma:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Table:
+class TableGeometry:
     """base_mm (3,): c. linear (3,): l. rotary (3,): a. mount (3, 3): R0. offset_mm (3,): o. In the camera's frame."""
 
     base_mm: Float
@@ -103,7 +103,7 @@ class Table:
         down = down / np.linalg.norm(down)
         return np.stack([crosses(down) @ self.linear, down, self.linear])
 
-    def stepped(self, change: Float) -> Table:
+    def stepped(self, change: Float) -> TableGeometry:
         """The table a step (12,) away: c, l, a, R0, o in mm and rad."""
         sideways = across(self.rotary)
         linear = self.linear + across(self.linear) @ change[3:5]

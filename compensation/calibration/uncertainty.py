@@ -86,7 +86,7 @@ def _jacobian(adjustment: Adjustment, points_mm: Float, pixels: Float) -> Float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Difference:
+class CameraDifference:
     """pixels (H, W, 2), shift_px (H, W, 2): where the second camera sees what the first one sees at the pixels; NaN
     where one of them saw no marker."""
 
@@ -100,7 +100,7 @@ class Difference:
         return float(np.sqrt(np.nanmean(self.shift_px**2)))
 
 
-def difference(first: Adjustment, second: Adjustment, distance_mm: float, columns: int = 25) -> Difference:
+def difference(first: Adjustment, second: Adjustment, distance_mm: float, columns: int = 25) -> CameraDifference:
     """How two calibrations from different positions of one table differ, their frames brought together by the table."""
     turn, shift = _between(first, second)
     pixels = grid_pixels(first.scene.lens.image_size, columns)
@@ -108,7 +108,7 @@ def difference(first: Adjustment, second: Adjustment, distance_mm: float, column
     points = np.concatenate([slopes, np.ones((*slopes.shape[:-1], 1))], axis=-1) * distance_mm
     moved_px = second.scene.lens.project(points @ turn.T + shift) - pixels
     known = seen(pixels, first.hull_px) & seen(pixels, second.hull_px)
-    return Difference(distance_mm, pixels, np.where(known[..., None], moved_px, np.nan))
+    return CameraDifference(distance_mm, pixels, np.where(known[..., None], moved_px, np.nan))
 
 
 def _between(first: Adjustment, second: Adjustment) -> tuple[Float, Float]:

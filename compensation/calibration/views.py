@@ -58,7 +58,7 @@ def projection_sigma_um(found: ViewCalibration, pixels: Float, distance_mm: floa
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class PointUncertainty:
     """Expanded uncertainties (k = 2), um, across the line of sight at distance_mm: in the middle of the picture, at its
     corners (top left and right, bottom left and right) and the largest where markers were seen. None: not seen there;
     not_seen says so, "" when all of these were."""
@@ -82,7 +82,7 @@ class Known:
         )
 
 
-def known(found: ViewCalibration, distance_mm: float) -> Known:
+def known(found: ViewCalibration, distance_mm: float) -> PointUncertainty:
     """How well it knows points at Z = distance_mm."""
     width, height = found.scene.lens.image_size
     corners = [(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)]
@@ -91,7 +91,7 @@ def known(found: ViewCalibration, distance_mm: float) -> Known:
     sigma_um = COVERAGE * projection_sigma_um(found, everywhere, distance_mm)
     middle, *at_corners = [None if np.isnan(um) else float(um) for um in sigma_um[: len(pixels)]]
     not_seen = NOT_SEEN if None in (middle, *at_corners) else ""
-    return Known(distance_mm, middle, tuple(at_corners), float(np.nanmax(sigma_um)), not_seen)
+    return PointUncertainty(distance_mm, middle, tuple(at_corners), float(np.nanmax(sigma_um)), not_seen)
 
 
 def _two_digits(value_um: float) -> str:

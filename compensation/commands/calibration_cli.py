@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from thermostand.compensation.calibration.calibrate import Calibration, Model, calibrate
+from thermostand.compensation.calibration.calibrate import CameraCalibration, Model, calibrate
 from thermostand.compensation.calibration.camera_file import CameraFile, camera_file
 from thermostand.compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
 from thermostand.compensation.calibration.pinhole import NAMES
@@ -132,7 +132,7 @@ def _projection(file: CameraFile) -> list[str]:
     ]
 
 
-def _file(session: Session, target_name: str, found: Calibration, *, keep_rays: bool) -> CameraFile:
+def _file(session: Session, target_name: str, found: CameraCalibration, *, keep_rays: bool) -> CameraFile:
     return camera_file(
         found,
         camera_serial=serial_of(session),

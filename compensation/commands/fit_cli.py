@@ -15,8 +15,8 @@ from thermostand.compensation.budget.geometry import load_geometry
 from thermostand.compensation.commands.options import (
     CameraName,
     DetailsOption,
-    Finding,
     Incomplete,
+    MarkerSearch,
     TargetOption,
     named_target,
     open_session,
@@ -102,7 +102,7 @@ def write_datasheet(
     details: DetailsOption = None,
     camera: CameraName = None,
     *,
-    finding: Finding,
+    finding: MarkerSearch,
 ) -> None:
     """Write a camera's thermal datasheet: px/K and ppm/K, settling, hysteresis, what each form of compensation leaves,
     each with its expanded uncertainty and the budget it comes from.
@@ -153,7 +153,7 @@ def fit(
     ] = None,
     camera: CameraName = None,
     *,
-    finding: Finding,
+    finding: MarkerSearch,
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
@@ -203,7 +203,7 @@ def anchor(
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write, for this session.")],
     camera: CameraName = None,
     *,
-    finding: Finding,
+    finding: MarkerSearch,
 ) -> None:
     """Fit a model to where the target is in a new session, with a few reference frames of the session itself.
 
@@ -281,7 +281,7 @@ def report(
     details: DetailsOption = None,
     camera: CameraName = None,
     *,
-    finding: Finding,
+    finding: MarkerSearch,
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 

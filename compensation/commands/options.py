@@ -39,7 +39,7 @@ Incomplete = Annotated[bool, typer.Option("--incomplete", help="Use a session al
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class MarkerSearch:
     """How a command finds the markers of the sessions it is given."""
 
     target: TargetOption = None

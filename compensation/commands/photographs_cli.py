@@ -18,7 +18,7 @@ from thermostand.compensation.calibration.pinhole import NAMES
 from thermostand.compensation.calibration.rig import RigCalibration, calibrate_rig
 from thermostand.compensation.calibration.views import (
     LEAST_MARKERS,
-    Known,
+    PointUncertainty,
     ViewCalibration,
     Views,
     calibrate_views,
@@ -218,7 +218,11 @@ def calibrate_photographs(
 
 
 def summary(
-    found: ViewCalibration, views: Views, held_out_px: float | None, projection: Known, target: Target | BoardOfCorners
+    found: ViewCalibration,
+    views: Views,
+    held_out_px: float | None,
+    projection: PointUncertainty,
+    target: Target | BoardOfCorners,
 ) -> str:
     """The calibration in a few lines."""
     lens = found.scene.lens

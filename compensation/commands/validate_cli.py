@@ -10,7 +10,7 @@ import typer
 
 from thermostand.compensation.budget.geometry import load_geometry
 from thermostand.compensation.calibration.camera_file import load_camera
-from thermostand.compensation.commands.options import Finding
+from thermostand.compensation.commands.options import MarkerSearch
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.observations import Float
 from thermostand.compensation.one_camera import name_of
@@ -47,7 +47,7 @@ def validate_session(
         LensModel, typer.Option(help="Which model of the camera file gives the poses.")
     ] = LensModel.PINHOLE,
     *,
-    finding: Finding,
+    finding: MarkerSearch,
 ) -> None:
     """How far the target at V0..V3 seems to move with temperature, before and after compensation, beside the paper's.
 

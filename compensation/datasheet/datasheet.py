@@ -10,7 +10,7 @@ import numpy as np
 
 from thermostand.compensation.datasheet.details import Details
 from thermostand.compensation.datasheet.motions import MOTIONS, UNITS, Visits, Warming, motions, visits_of, warming_of
-from thermostand.compensation.datasheet.quantity import Contribution, Quantity, direct, pooled
+from thermostand.compensation.datasheet.quantity import Contribution, MeasuredQuantity, direct, pooled
 from thermostand.compensation.drift.bumps import around_bumps
 from thermostand.compensation.drift.choosing import FORMS
 from thermostand.compensation.drift.drift_model import DriftModel
@@ -22,18 +22,18 @@ from thermostand.foundation.errors import SessionError
 _FEWEST = 3
 
 
-def hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float]) -> list[Quantity]:
+def hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float]) -> list[MeasuredQuantity]:
     """RMS of heating minus cooling over set-points reached from both sides, mpx. scatter_px: what does not repeat."""
     model = "root mean square of (heating − cooling) over set-points reached from both sides, mean over the markers"
-    quantities: list[Quantity] = []
+    quantities: list[MeasuredQuantity] = []
     for axis, name in enumerate("IJ"):
         key, title = f"hysteresis_{name}", f"Heating against cooling, {name}"
         gaps = [] if found is None else found.gaps
         differences = 1e3 * np.array([gap.difference_px[axis] for gap in gaps])
-        one = Quantity(key, "Dependence on the way", title, "mpx", math.nan, model)
+        one = MeasuredQuantity(key, "Dependence on the way", title, "mpx", math.nan, model)
         if len(differences) < _FEWEST:
             why = "fewer than three set-points were reached from both sides"
-            quantities.append(Quantity(key, one.group, title, "mpx", math.nan, model, (), why))
+            quantities.append(MeasuredQuantity(key, one.group, title, "mpx", math.nan, model, (), why))
             continue
         noise = 1e3 * float(np.sqrt(np.mean([gap.uncertainty_px[axis] ** 2 for gap in gaps])))
         repeats = 1e3 * scatter_px[axis] * math.sqrt(2 / len(differences))
@@ -42,22 +42,24 @@ def hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float])
             direct("noise of the markers", "A", noise / math.sqrt(len(differences)), "mpx", "as the marker fit claims"),
             direct("what does not repeat", "A", repeats, "mpx", UNREPEATED),
         )
-        quantities.append(Quantity(key, one.group, title, "mpx", _rms(differences), model, lines))
+        quantities.append(MeasuredQuantity(key, one.group, title, "mpx", _rms(differences), model, lines))
     return quantities
 
 
-def residual_quantities(form: str, evaluation: Evaluation | None, scatter_px: Sequence[float]) -> list[Quantity]:
+def residual_quantities(
+    form: str, evaluation: Evaluation | None, scatter_px: Sequence[float]
+) -> list[MeasuredQuantity]:
     """RMS along I and J at held-out set-points, mpx; the marker's noise of single frames is in it."""
     model = (
         "root mean square of (reference − corrected) over all centres at held-out set-points, with their noise in it"
     )
     group = "Left after compensation"
-    quantities: list[Quantity] = []
+    quantities: list[MeasuredQuantity] = []
     for axis, name in enumerate("IJ"):
         key, title = f"left_{form}_{name}", f"The {form} form, {name}: RMS at held-out set-points"
         if evaluation is None or len(evaluation.temperatures) < _FEWEST:
             why = "the sessions do not support this form, or have fewer than three set-points to score it"
-            quantities.append(Quantity(key, group, title, "mpx", math.nan, model, (), why))
+            quantities.append(MeasuredQuantity(key, group, title, "mpx", math.nan, model, (), why))
             continue
         each = 1e3 * np.array([row.after_px[axis] for row in evaluation.temperatures])
         value = 1e3 * evaluation.rms_after_px[axis]
@@ -67,7 +69,7 @@ def residual_quantities(form: str, evaluation: Evaluation | None, scatter_px: Se
             direct("choice of set-points", "A", _jackknife(each, _rms), "mpx", "each left out once"),
             direct("what does not repeat", "A", repeats, "mpx", UNREPEATED),
         )
-        quantities.append(Quantity(key, group, title, "mpx", value, model, lines))
+        quantities.append(MeasuredQuantity(key, group, title, "mpx", value, model, lines))
     return quantities
 
 
@@ -129,12 +131,12 @@ def curve(visits: Visits, motion: int) -> Curve | None:
     return Curve(float(found[1]), u_slope, float(found[4]) if both else 0.0, scatter, float(np.ptp(visits.air_degC)))
 
 
-def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> list[Quantity]:
+def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> list[MeasuredQuantity]:
     """Of the four motions."""
-    found: list[Quantity] = []
+    found: list[MeasuredQuantity] = []
     for motion, (key, name, unit) in enumerate(zip(MOTIONS, NAMES, UNITS, strict=True)):
         fitted = curve(visits, motion)
-        one = Quantity(f"{key}_per_K", _GROUP, name, f"{unit}/K", math.nan, _MODEL, why=_TOO_FEW)
+        one = MeasuredQuantity(f"{key}_per_K", _GROUP, name, f"{unit}/K", math.nan, _MODEL, why=_TOO_FEW)
         if fitted is None:
             found.append(one)
             continue
@@ -168,7 +170,7 @@ _NO_CURVE = "no temperature coefficient to compare with"
 
 def warming_quantities(
     warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float
-) -> list[Quantity]:
+) -> list[MeasuredQuantity]:
     """All of them; NaN with a reason where nothing was recorded. scatter: of MOTIONS, what does not repeat."""
     share = _share(warming, visits, scatter, u_air_K)
     return [
@@ -181,12 +183,12 @@ def warming_quantities(
     ]
 
 
-def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -> list[Quantity]:
-    found: list[Quantity] = []
+def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -> list[MeasuredQuantity]:
+    found: list[MeasuredQuantity] = []
     for motion, name in enumerate(_NAMES):
         key, unit = f"warm_up_{MOTIONS[motion]}", UNITS[motion]
         if warming is None:
-            found.append(Quantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP))
+            found.append(MeasuredQuantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP))
             continue
         value = float(warming.moved[-1, motion])
         minutes = warming.since_s[[0, -1]] / 60
@@ -199,7 +201,7 @@ def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -
                    unit, _OF_RESIDUALS),
             Contribution("temperature it began at", "B", u_air_K, "K", value / risen_K, "thermometer and its place"),
         )  # fmt: skip
-        found.append(Quantity(key, _SWITCHING_ON, name, unit, value, model, lines))
+        found.append(MeasuredQuantity(key, _SWITCHING_ON, name, unit, value, model, lines))
     return found
 
 
@@ -223,17 +225,17 @@ def frame_noise(since_s: Float, values: Float) -> float:
     return math.sqrt(float(left @ left) / (count - int(rank)))
 
 
-def _settling(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
+def _settling(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
     key, name = "settling_s", "Time to 90 % of the drift in the recorded warm-up"
     if warming is None:
-        return Quantity(key, _SWITCHING_ON, name, "s", math.nan, "", (), _NO_WARM_UP)
+        return MeasuredQuantity(key, _SWITCHING_ON, name, "s", math.nan, "", (), _NO_WARM_UP)
     whole = warming.moved[-1, :2]
     size = float(np.linalg.norm(whole))
     along = warming.moved[:, :2] @ whole / max(size, 1e-12)
     model = f"first time after which the drift along its direction stays above {_SETTLED:.0%} of its last value"
     noise = math.sqrt(2) * frame_noise(warming.since_s, along)
     if size < 10 * noise:
-        return Quantity(
+        return MeasuredQuantity(
             key, _SWITCHING_ON, name, "s", math.nan, model, (), "the warm-up moves the image by no more than noise"
         )
     below = int(np.flatnonzero(along < _SETTLED * size)[-1])
@@ -247,7 +249,7 @@ def _settling(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
                      UNREPEATED),
         direct("instant of switching on", "B", 0.5, "s", "a second between commands and readings"),
     )  # fmt: skip
-    return Quantity(key, _SWITCHING_ON, name, "s", value, model, lines)
+    return MeasuredQuantity(key, _SWITCHING_ON, name, "s", value, model, lines)
 
 
 def _slope(at_s: Float, values: Float, middle_s: float) -> float:
@@ -257,13 +259,13 @@ def _slope(at_s: Float, values: Float, middle_s: float) -> float:
     return abs(float(np.polyfit(at_s[near] - middle_s, values[near], 1)[0]))
 
 
-def _rate(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
+def _rate(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
     key, name, unit = "rate_at_end", "Drift still going on at the end of the warm-up", "mpx/min"
     if warming is None:
-        return Quantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP)
+        return MeasuredQuantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP)
     last = warming.since_s >= warming.since_s[-1] - _LAST_S
     if last.sum() < 4:
-        return Quantity(
+        return MeasuredQuantity(
             key, _SWITCHING_ON, name, unit, math.nan, "", (), "fewer than four frames in its last five minutes"
         )
     minutes = (warming.since_s[last] - warming.since_s[-1]) / 60
@@ -279,24 +281,24 @@ def _rate(warming: Warming | None, scatter: Sequence[float]) -> Quantity:
                      "a tenth of what the chosen form leaves may fall into these minutes"),
     )  # fmt: skip
     model = "length of the slope of a line through I and J over the last five minutes"
-    return Quantity(key, _SWITCHING_ON, name, unit, float(np.linalg.norm(fitted[1])), model, lines)
+    return MeasuredQuantity(key, _SWITCHING_ON, name, unit, float(np.linalg.norm(fitted[1])), model, lines)
 
 
-def _self_heating(visits: Visits, u_air_K: float) -> Quantity:
+def _self_heating(visits: Visits, u_air_K: float) -> MeasuredQuantity:
     name, model = "Self-heating, by its own sensor", "camera's own sensor minus the air near it, at the reference"
     excess = visits.camera_degC - visits.air_degC
     if not len(excess):
-        return Quantity(
+        return MeasuredQuantity(
             "self_heating_K", _SWITCHING_ON, name, "K", math.nan, model, (), "no air temperature near the camera"
         )
     lines = (
         direct("thermometer and its place", "B", u_air_K, "K", "stated, else assumed"),
         direct("the camera's sensor", "B", 0.25 / math.sqrt(12), "K", "steps of at most 0.25 K; its offset is unknown"),
     )
-    return Quantity("self_heating_K", _SWITCHING_ON, name, "K", float(excess[0]), model, lines)
+    return MeasuredQuantity("self_heating_K", _SWITCHING_ON, name, "K", float(excess[0]), model, lines)
 
 
-def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float) -> Quantity:
+def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float) -> MeasuredQuantity:
     """Of the shift per K of the air, how much the camera's own warming moves the image per K of its own sensor. The
     rest follows the surroundings: mount, fixture, and what of the camera stays at the air's temperature then."""
     key, name = "camera_share", "Part of the shift that follows the camera itself"
@@ -307,7 +309,7 @@ def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_
     )
     fitted = [curve(visits, axis) for axis in (0, 1)]
     if warming is None or fitted[0] is None or fitted[1] is None:
-        return Quantity(
+        return MeasuredQuantity(
             key, _SWITCHING_ON, name, "%", math.nan, model, (), _NO_WARM_UP if warming is None else _NO_CURVE
         )
     slope = np.array([one.slope for one in fitted if one])
@@ -315,7 +317,9 @@ def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_
     risen_K = float(warming.camera_degC[-1] - warming.camera_degC[0])
     size = float(slope @ slope)
     if risen_K < 2 or size < 1e-10:
-        return Quantity(key, _SWITCHING_ON, name, "%", math.nan, model, (), "the camera warmed by less than 2 K")
+        return MeasuredQuantity(
+            key, _SWITCHING_ON, name, "%", math.nan, model, (), "the camera warmed by less than 2 K"
+        )
     h = warming.moved[-1, :2] / risen_K
     share = float(h @ slope) / size
     by_slope = (h - 2 * share * slope) / size
@@ -326,10 +330,10 @@ def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_
         Contribution("coefficient along J", "A", float(u_slope[1]), "px/K", 100 * float(by_slope[1]), "as above"),
         Contribution("warming of the camera", "B", u_air_K, "K", 100 * share / risen_K, "of its own sensor"),
     )  # fmt: skip
-    return Quantity(key, _SWITCHING_ON, name, "%", 100 * share, model, lines)
+    return MeasuredQuantity(key, _SWITCHING_ON, name, "%", 100 * share, model, lines)
 
 
-def _rest(share: Quantity) -> Quantity:
+def _rest(share: MeasuredQuantity) -> MeasuredQuantity:
     """What the camera's share leaves, as uncertain as that."""
     lines = tuple(replace(line, sensitivity=-line.sensitivity) for line in share.contributions)
     name, model = "Part of the shift that follows mount and surroundings", "100 % less the part that follows the camera"
@@ -344,15 +348,15 @@ class Datasheet:
     observations: Observations
     details: Details
     model: DriftModel
-    quantities: tuple[Quantity, ...]
-    nights: tuple[tuple[Quantity, ...], ...]
+    quantities: tuple[MeasuredQuantity, ...]
+    nights: tuple[tuple[MeasuredQuantity, ...], ...]
     visits: tuple[Visits, ...]
     warming: Warming | None
     air_degC: tuple[float, float]
     camera_degC: tuple[float, float]
 
     @property
-    def by_key(self) -> Mapping[str, Quantity]:
+    def by_key(self) -> Mapping[str, MeasuredQuantity]:
         """The quantities by their names."""
         return {one.key: one for one in self.quantities}
 
@@ -364,7 +368,7 @@ def datasheet(observations: Observations, model: DriftModel, details: Details | 
     moved = motions(steady)
     of_session = {one.session_id: one for one in hysteresis(steady)}
     evaluations = _evaluations(model, observations)
-    nights: list[tuple[Quantity, ...]] = []
+    nights: list[tuple[MeasuredQuantity, ...]] = []
     visits: list[Visits] = []
     warmings: list[Warming | None] = []
     for index, facts in enumerate(observations.sessions):

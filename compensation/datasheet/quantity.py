@@ -35,7 +35,7 @@ class Contribution:
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class MeasuredQuantity:
     """key: its name in the JSON file. model: the measurement equation, in words and symbols. group: the heading it
     stands under. value: NaN when it could not be measured, and `why` says so."""
 
@@ -66,7 +66,7 @@ def direct(source: str, kind: Literal["A", "B"], u: float, unit: str, basis: str
     return Contribution(source, kind, u, unit, 1.0, basis)
 
 
-def pooled(nights: Sequence[Quantity]) -> Quantity:
+def pooled(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
     """The mean of the same quantity over nights. What each night's statistics say shrinks with their number, what is of
     type B is common to all; how they differ is a contribution of its own."""
     known = [one for one in nights if not math.isnan(one.value)]

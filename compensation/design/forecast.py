@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from thermostand.compensation.drift_runtime import Follower
 from thermostand.compensation.expression import AIR, POWER, lag
-from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.states import Float, States, ThermalMemory
 from thermostand.compensation.history.thermal_history import damped_least_squares, states_at
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
@@ -30,7 +30,7 @@ _EVERY = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
+class CameraSurroundings:
     """What the night says of chamber and camera. air (2,): offset and slope of the recorded air over set-points.
     camera (2 + K,): of a powered camera, a constant, the weights of the air and of its lags. ramp_K_per_min: at most.
     """
@@ -49,7 +49,7 @@ class Surroundings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Situation:
+class ForecastState:
     """S situations. target_degC (S,): what the air follows. air_degC (S,). camera_lags (S, K): lags of the air that the
     camera is made of. states: what a drift model remembers, of the air, the supply and the camera."""
 
@@ -58,31 +58,33 @@ class Situation:
     camera_lags: Float
     states: States
 
-    def where(self, rows: NDArray[np.int64]) -> Situation:
+    def where(self, rows: NDArray[np.int64]) -> ForecastState:
         """These situations, in this order."""
-        return Situation(self.target_degC[rows], self.air_degC[rows], self.camera_lags[rows], self.states.where(rows))
+        return ForecastState(
+            self.target_degC[rows], self.air_degC[rows], self.camera_lags[rows], self.states.where(rows)
+        )
 
 
-def together(parts: Sequence[Situation]) -> Situation:
+def together(parts: Sequence[ForecastState]) -> ForecastState:
     """The situations of all these, which remember the same; ValueError for none."""
     columns = [(part.target_degC, part.air_degC, part.camera_lags, part.states.rows) for part in parts]
     target, air, lags, rows = (np.concatenate(each) for each in zip(*columns, strict=True))
-    return Situation(target, air, lags, States(parts[0].states.memory, rows))
+    return ForecastState(target, air, lags, States(parts[0].states.memory, rows))
 
 
-def surroundings(observations: Observations, ramp_K_per_min: float) -> Surroundings:
+def surroundings(observations: Observations, ramp_K_per_min: float) -> CameraSurroundings:
     """What the last session says; SessionError when it has no history of the air or too few readings of the camera."""
     history = observations.histories[-1] if observations.histories else None
     if history is None or not history.has_ambient or len(history.camera_ns) < 10 * _EVERY:
         raise SessionError("the session has no history of air and camera; nothing can be foreseen")
     at_ns, recorded_degC = history.camera_ns[::_EVERY], history.camera_degC[::_EVERY]
-    states = states_at(history, Memory((*_AIR_LAGS, *_POWER_LAGS)), at_ns, recorded_degC)
+    states = states_at(history, ThermalMemory((*_AIR_LAGS, *_POWER_LAGS)), at_ns, recorded_degC)
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
     # While it warms up the supply's lags explain it; of a camera that has been on for long they are 1.
     terms = np.column_stack([np.ones(len(air)), air, states.of(_AIR_LAGS), states.of(_POWER_LAGS) - 1])
     known = np.isfinite(terms).all(axis=1) & np.isfinite(recorded_degC)
     weights = damped_least_squares(terms[known], recorded_degC[known], _RIDGE)
-    return Surroundings(_air(observations), weights[: 2 + len(_AIR_LAGS)], ramp_K_per_min)
+    return CameraSurroundings(_air(observations), weights[: 2 + len(_AIR_LAGS)], ramp_K_per_min)
 
 
 def _air(observations: Observations) -> Float:
@@ -95,17 +97,17 @@ def _air(observations: Observations) -> Float:
     return np.array([offset, slope]) if 0.5 < slope < 1.5 else np.array([0.0, 1.0])
 
 
-def now(observations: Observations, memory: Memory) -> Situation:
+def now(observations: Observations, memory: ThermalMemory) -> ForecastState:
     """At the last frame of the last session."""
     history = observations.histories[-1]
     own = observations.session == len(observations.sessions) - 1
     at_ns, recorded_degC = observations.time_ns[own][-1:], observations.camera_degC[own][-1:]
-    lags = states_at(history, Memory(tuple(_AIR_LAGS)), at_ns, recorded_degC).of(_AIR_LAGS)
+    lags = states_at(history, ThermalMemory(tuple(_AIR_LAGS)), at_ns, recorded_degC).of(_AIR_LAGS)
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
-    return Situation(air, air, lags, states_at(history, memory, at_ns, recorded_degC))
+    return ForecastState(air, air, lags, states_at(history, memory, at_ns, recorded_degC))
 
 
-def at_rest(around: Surroundings, set_points_degC: Float, memory: Memory) -> Situation:
+def at_rest(around: CameraSurroundings, set_points_degC: Float, memory: ThermalMemory) -> ForecastState:
     """Of a powered camera after a long time at set-points (S,); plays are as after a way from a colder place."""
     air = around.air_degC(set_points_degC)
     lags = np.repeat(air[:, None], len(_AIR_LAGS), axis=1)
@@ -113,15 +115,17 @@ def at_rest(around: Surroundings, set_points_degC: Float, memory: Memory) -> Sit
     values = follower.rest([around.camera_degC(air, lags), air, np.ones(len(air))])
     for place, _, is_play, radius_K in follower.parts:
         values[place] = values[place] - (radius_K if is_play else 0.0)
-    return Situation(air, air, lags, _states(memory, values))
+    return ForecastState(air, air, lags, _states(memory, values))
 
 
-def _states(memory: Memory, values: Sequence[Float]) -> States:
+def _states(memory: ThermalMemory, values: Sequence[Float]) -> States:
     """Of a camera that has been on, and followed, for long."""
     return States(memory, np.column_stack([*values, *np.full((2, len(values[0])), np.inf)]))
 
 
-def after(around: Surroundings, situation: Situation, set_points_degC: Float, dwell_s: Float) -> Situation:
+def after(
+    around: CameraSurroundings, situation: ForecastState, set_points_degC: Float, dwell_s: Float
+) -> ForecastState:
     """After dwells (S,) at set-points (S,), s and degC."""
     goal, memory = around.air_degC(set_points_degC), situation.states.memory
     left_s = np.asarray(dwell_s, np.float64).copy()
@@ -142,7 +146,7 @@ def after(around: Surroundings, situation: Situation, set_points_degC: Float, dw
         camera = np.where(dt[:, 0] > 0, around.camera_degC(air, np.column_stack(lags)), before_camera)
         mean = [(camera + before_camera) / 2, mean_air, on]
         values = _moved(of_model, [camera, mean_air, on, *values[3:]], mean, dt)
-    return Situation(target, air, np.column_stack(lags), _states(memory, values))
+    return ForecastState(target, air, np.column_stack(lags), _states(memory, values))
 
 
 def _moved(follower: Follower, now: list[Float], mean: list[Float], dt_s: Float) -> list[Float]:

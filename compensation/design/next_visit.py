@@ -21,8 +21,8 @@ from typing import Literal
 import numpy as np
 
 from thermostand.compensation.design.forecast import (
-    Situation,
-    Surroundings,
+    CameraSurroundings,
+    ForecastState,
     after,
     at_rest,
     now,
@@ -33,7 +33,7 @@ from thermostand.compensation.drift.candidates import FEWEST_BETWEEN
 from thermostand.compensation.drift.terms import features
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.history.states import Float, ThermalMemory
 from thermostand.compensation.history.thermal_history import recorded_history
 from thermostand.compensation.observations import Observations, observe
 from thermostand.experiments.steps import WANTED_STATES, Role, WantedState
@@ -47,8 +47,8 @@ _AFTER_S: dict[WantedState, float] = {"at_rest": 4 * 3600.0, "on_the_way": 2700.
 
 
 def wanted_states(
-    around: Surroundings, memory: Memory, range_degC: tuple[float, float], kinds: Sequence[WantedState]
-) -> Situation:
+    around: CameraSurroundings, memory: ThermalMemory, range_degC: tuple[float, float], kinds: Sequence[WantedState]
+) -> ForecastState:
     """Of a powered camera throughout the range: so long after it was brought there from rest in the middle, or half way
     to either end. Both ways to a temperature and what creeps are in these. ValueError without a kind."""
     low, high = range_degC
@@ -64,18 +64,18 @@ _THIRDS, _EVERY = 3, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Known:
+class DesignState:
     """covariance (H, H), px^2: of the coefficients. noise_px2: of one more instant. wanted (W, H): features of the
     states in which the model is wanted. features: of situations (S,), (S, H)."""
 
     covariance: Float
     noise_px2: float
     wanted: Float
-    features: Callable[[Situation], Float]
+    features: Callable[[ForecastState], Float]
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class BestCourse:
     """The first visit of a course. variance_px2: of the model after all of it, mean over the wanted states."""
 
     chamber_degC: float
@@ -84,18 +84,23 @@ class Course:
 
 
 def best_course(
-    known: Known, here: Situation, around: Surroundings, grid_degC: Float, dwells_s: Sequence[float], seed: int
-) -> Course:
+    known: DesignState,
+    here: ForecastState,
+    around: CameraSurroundings,
+    grid_degC: Float,
+    dwells_s: Sequence[float],
+    seed: int,
+) -> BestCourse:
     """Of courses of each dwell, about as long together: the one after which the mean variance over the wanted states is
     least. The same for a seed."""
     rng = np.random.default_rng([20, seed])
     moment = known.wanted.T @ known.wanted / len(known.wanted)
-    best: Course | None = None
+    best: BestCourse | None = None
     for dwell_s in dwells_s:
         set_points = _drawn(grid_degC, max(1, round(_HORIZON_S / dwell_s)), rng)
         variance_px2 = _after_courses(known, here, around, set_points, dwell_s, moment)
         first = int(np.argmin(variance_px2))
-        found = Course(float(set_points[first, 0]), dwell_s, float(variance_px2[first]))
+        found = BestCourse(float(set_points[first, 0]), dwell_s, float(variance_px2[first]))
         best = found if best is None or found.variance_px2 < best.variance_px2 else best
     if best is None:
         raise ValueError("there is no dwell to choose from")
@@ -103,7 +108,12 @@ def best_course(
 
 
 def _after_courses(
-    known: Known, here: Situation, around: Surroundings, set_points: Float, dwell_s: float, moment: Float
+    known: DesignState,
+    here: ForecastState,
+    around: CameraSurroundings,
+    set_points: Float,
+    dwell_s: float,
+    moment: Float,
 ) -> Float:
     """(S,), px^2: the variance after each course (S, visits); the covariance of each is updated visit by visit (the
     Sherman-Morrison formula)."""
@@ -214,7 +224,7 @@ def decide(observations: Observations, wanted: Wanted) -> Decision:
         return Decision("enough", math.nan, 0.0, predicted_px, reason)
     if _few_between(observations) and _without_discrepancy_px(model, asked) <= wanted.residual_px:
         return _furthest(observations, wanted, grid, _UNCHECKED)
-    known = Known(
+    known = DesignState(
         model.leverage_matrix,
         float(model.discrepancy_px @ model.discrepancy_px),
         _features(model, asked),
@@ -229,7 +239,7 @@ def decide(observations: Observations, wanted: Wanted) -> Decision:
     return Decision("visit", course.chamber_degC, course.dwell_s, predicted_px, reason)
 
 
-def predicted_residual_px(model: ThermalModel, asked: Situation) -> float:
+def predicted_residual_px(model: ThermalModel, asked: ForecastState) -> float:
     """RMS of a coordinate over these situations and the outline of the markers, within the night."""
     hull_px = model.facts.hull_px
     situations, places = len(asked.air_degC), len(hull_px)
@@ -252,7 +262,7 @@ def _few_between(observations: Observations) -> bool:
     return len(_seen_degC(observations)) - 2 < FEWEST_BETWEEN
 
 
-def _without_discrepancy_px(model: ThermalModel, asked: Situation) -> float:
+def _without_discrepancy_px(model: ThermalModel, asked: ForecastState) -> float:
     return predicted_residual_px(replace(model, discrepancy_px=np.zeros(2)), asked)
 
 
@@ -268,6 +278,6 @@ def _furthest(observations: Observations, wanted: Wanted, grid: Float, why: str)
     return Decision("visit", degC, dwell_s, math.nan, f"{why}; {degC:g} degC is furthest from the others")
 
 
-def _features(model: ThermalModel, situation: Situation) -> Float:
+def _features(model: ThermalModel, situation: ForecastState) -> Float:
     found = features(situation.states, [term.feature for term in model.terms], model.origin)
     return found - model.reference_features

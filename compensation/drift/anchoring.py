@@ -18,7 +18,7 @@ from thermostand.compensation.drift.displacements import Displacements, displace
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import check_same
 from thermostand.compensation.drift.facts import facts_of
-from thermostand.compensation.drift.terms import MOTIONS, Constant, features
+from thermostand.compensation.drift.terms import MOTIONS, ConstantTerm, features
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import condense_instants, frame_states, training
 from thermostand.compensation.history.states import Float
@@ -155,7 +155,7 @@ def _updated(model: ThermalModel, observations: Observations, rows: Displacement
     if len(seen.amounts_px) == 0:
         raise SessionError("the markers of the session's reference frames do not determine how the image has moved")
     coefficients, covariance = model.coefficients.copy(), model.coefficient_covariance.copy()
-    constant = [isinstance(term, Constant) for term in model.terms].index(True)
+    constant = [isinstance(term, ConstantTerm) for term in model.terms].index(True)
     covariance[:, constant, constant] += _UNKNOWN_PX**2
     feature, seen_px = seen.features.mean(axis=0), seen.amounts_px.mean(axis=0)
     noise_px2 = seen.variance_px2.mean(axis=0) / len(seen.amounts_px)

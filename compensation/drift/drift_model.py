@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from thermostand.compensation.drift.candidates import Candidate, Pair
 from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.hull import MARGIN_PX, distances_px
-from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.states import Float, States, ThermalMemory
 
 Flags = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -60,7 +60,7 @@ class DriftModel(ABC):
 
     @property
     @abstractmethod
-    def memory(self) -> Memory:
+    def memory(self) -> ThermalMemory:
         """What has to be remembered for it: history.states_at and states.state_of take it."""
 
     @abstractmethod
@@ -98,7 +98,7 @@ class DriftModel(ABC):
         return self.flags(xy_px, state) == 0
 
 
-def states_of(state: Situation, count: int, memory: Memory) -> States:
+def states_of(state: Situation, count: int, memory: ThermalMemory) -> States:
     """One state for each of `count` points. ValueError when there are more or fewer, or a temperature alone is given to
     a form that remembers."""
     if not isinstance(state, States):

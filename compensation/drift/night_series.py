@@ -13,7 +13,7 @@ from thermostand.compensation.drift.terms import features, motions
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.drift_runtime import remembered
 from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, lag, play
-from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.history.states import Float, ThermalMemory
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
@@ -134,7 +134,7 @@ def _condensed(session_id: str, frames: _Frames) -> NightSeries:
 
 def _features(observations: Observations) -> tuple[Float, Mask]:
     """(F, H) of all frames, and which are known (F,): none without a history of the air, where lag looks like steps."""
-    states = frame_states(observations, Memory(remembered(_FEATURES)))
+    states = frame_states(observations, ThermalMemory(remembered(_FEATURES)))
     if not np.isfinite(observations.air_degC).any():
         return np.empty((len(observations.frame), 0)), np.zeros(len(observations.frame), bool)
     origin = Origin(float(np.nanmean(states.camera_degC)), float(np.nanmean(observations.air_degC)))

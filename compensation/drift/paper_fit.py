@@ -16,8 +16,8 @@ from thermostand.compensation.drift.paper_model import (
     DegreeScore,
     Float,
     PaperModel,
+    PolynomialFit,
     Scaling,
-    Solution,
     condense,
     design,
     exponents,
@@ -153,7 +153,7 @@ def _condensed(rows: Displacements, degree: int, scaling: Scaling) -> list[_Fold
     return folds
 
 
-def _solutions(folds: Sequence[_Fold]) -> list[Solution]:
+def _solutions(folds: Sequence[_Fold]) -> list[PolynomialFit]:
     """The fits of I and of J to all rows of the folds; LinAlgError when they do not determine them."""
     count = sum(fold.count for fold in folds)
     return [solve([fold.triangles[axis] for fold in folds], count) for axis in (0, 1)]

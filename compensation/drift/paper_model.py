@@ -26,7 +26,7 @@ from thermostand.compensation.drift.drift_model import (
     range_flags,
     states_of,
 )
-from thermostand.compensation.history.states import Memory
+from thermostand.compensation.history.states import ThermalMemory
 from thermostand.foundation.documents import Document
 
 Float = NDArray[np.float64]
@@ -67,7 +67,7 @@ def design(xy_px: Float, camera_degC: Float, degree: int, scaling: Scaling) -> F
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class PolynomialFit:
     """A weighted least-squares fit of one coordinate.
 
     coefficients (K,). covariance (K, K): (A' W A)^-1, times chi^2 per degree of freedom where that exceeds 1.
@@ -86,7 +86,7 @@ def condense(terms: Float, values: Float, variance: Float) -> Float:
     return _triangle(np.column_stack([terms, values]) * weight[:, None])
 
 
-def solve(triangles: Sequence[Float], count: int) -> Solution:
+def solve(triangles: Sequence[Float], count: int) -> PolynomialFit:
     """The fit of all the rows, `count` of them, that were condensed into the triangles; raises LinAlgError when they
     do not determine it."""
     r = _triangle(np.concatenate(triangles))
@@ -98,7 +98,7 @@ def solve(triangles: Sequence[Float], count: int) -> Solution:
         raise np.linalg.LinAlgError(f"singular values from {singular[0]:.2g} to {singular[-1]:.2g}")
     inverse = cast(Float, np.linalg.inv(r[:terms, :terms]))
     chi2 = float((r[terms:, terms] ** 2).sum()) / max(count - terms, 1)
-    return Solution(
+    return PolynomialFit(
         coefficients=inverse @ r[:terms, terms],
         covariance=inverse @ inverse.T * max(chi2, 1.0),
         condition=float(singular[0] / singular[-1]),
@@ -144,9 +144,9 @@ class PaperModel(DriftModel):
     scores: tuple[DegreeScore, ...]
 
     @property
-    def memory(self) -> Memory:
+    def memory(self) -> ThermalMemory:
         """It needs nothing remembered."""
-        return Memory()
+        return ThermalMemory()
 
     @property
     def scaling(self) -> Scaling:

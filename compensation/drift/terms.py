@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 
 from thermostand.compensation.drift_runtime import compiled, remembered
 from thermostand.compensation.expression import AIR, CAMERA, Expression, Feature, Origin, away, in_words, lag, play
-from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.states import Float, States, ThermalMemory
 from thermostand.foundation.document_faults import path_text
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
@@ -74,7 +74,7 @@ class Term(Document):
         return (cls(),)
 
 
-class Constant(Term):
+class ConstantTerm(Term):
     """The misfit at the reference."""
 
     kind = "constant"
@@ -238,12 +238,12 @@ def term_of(value: object) -> Term:
         raise ValueError("; ".join(f"{path_text(each['loc'])}: {each['msg']}" for each in error.errors())) from error
 
 
-def memory_of(terms: Sequence[Term], self_heating_K: float) -> Memory:
+def memory_of(terms: Sequence[Term], self_heating_K: float) -> ThermalMemory:
     """What the terms need remembered, and a lag of the ambient in any case: its range is part of where a model holds,
     also where a warm-up has shown the camera at every temperature."""
     parts = remembered([term.feature for term in terms])
     quickest = () if any(part[:2] == ("lag", AIR) for part in parts) else (lag(AIR, _QUICK_S),)
-    return Memory((*parts, *quickest), self_heating_K)
+    return ThermalMemory((*parts, *quickest), self_heating_K)
 
 
 def features(states: States, these: Sequence[Feature], origin: Origin) -> Float:

@@ -66,7 +66,7 @@ class _Believed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Learned:
+class LearnedTerms:
     """coefficients (8, H), px, and their covariance (8, H, H), px^2. wander_px2 (8,): variance of what wanders."""
 
     instants: Instants
@@ -96,7 +96,7 @@ class Learned:
         return np.einsum("kmg,kmh->mgh", away, away) * (len(each) - 1) / len(each)
 
 
-def learn(instants: Instants, terms: Sequence[Term]) -> Learned:
+def learn(instants: Instants, terms: Sequence[Term]) -> LearnedTerms:
     """The most likely prior and noise of each motion, and what they make of these instants."""
     groups = list(dict.fromkeys(term.width for term in terms))
     group = np.array([groups.index(term.width) for term in terms])
@@ -117,7 +117,7 @@ def learn(instants: Instants, terms: Sequence[Term]) -> Learned:
         _solved(_equations(instants.features, amounts, own.weighting), motion, own)
         for motion, own in enumerate(believed)
     ]
-    return Learned(
+    return LearnedTerms(
         instants,
         np.array([coefficients for coefficients, _ in solved]) * scale_px[:, None],
         np.array([covariance for _, covariance in solved]) * (_UNSAID * scale_px[:, None, None]) ** 2,
@@ -200,7 +200,7 @@ class _Taught:
     the others teach. moving (M, 2): such residuals of frames that were not at rest."""
 
     trained: Training
-    learned: Learned
+    learned: LearnedTerms
     rows: Displacements
     held_out: Float
     moving: Float
@@ -235,7 +235,7 @@ def _taught(trained: Training) -> _Taught:
 
 
 def _held_out(
-    trained: Training, learned: Learned, rows: Displacements, of_instant: NDArray[np.float64], of_row: Float
+    trained: Training, learned: LearnedTerms, rows: Displacements, of_instant: NDArray[np.float64], of_row: Float
 ) -> Float:
     """Residuals (M, 2) of the rows, each from what is learned without the instants (I,) of its own fold (M,)."""
     residual = rows.displacement_px.copy()

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from thermostand.compensation.drift.candidates import between
 from thermostand.compensation.drift.displacements import Displacements, anchors, displacements
-from thermostand.compensation.drift.terms import MOTIONS, Constant, Term, features, motions
+from thermostand.compensation.drift.terms import MOTIONS, ConstantTerm, Term, features, motions
 from thermostand.compensation.expression import Origin
-from thermostand.compensation.history.states import Float, Memory, States
+from thermostand.compensation.history.states import Float, States, ThermalMemory
 from thermostand.compensation.history.thermal_history import states_at
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
@@ -161,7 +161,7 @@ class Training:
         return condense_instants(self.observations, self.rows, self.features, self.folds)
 
 
-def frame_states(observations: Observations, memory: Memory) -> States:
+def frame_states(observations: Observations, memory: ThermalMemory) -> States:
     """The thermal state at every frame (F,) of all sessions, each from its own history."""
     if not observations.histories:
         return States.at_degC(observations.camera_degC, len(observations.frame), memory)
@@ -182,7 +182,7 @@ def self_heating_K(observations: Observations) -> float:
     return max(float(np.nanmean(excess_K)), 1.0)
 
 
-def training(observations: Observations, terms: tuple[Term, ...], memory: Memory) -> Training:
+def training(observations: Observations, terms: tuple[Term, ...], memory: ThermalMemory) -> Training:
     """SessionError when no frame's thermal state is known."""
     reference = observations.of(Role.REFERENCE)
     states = frame_states(observations, memory)
@@ -214,7 +214,7 @@ def _relative(observations: Observations, terms: tuple[Term, ...], found: Float,
 
     The constant is the misfit at the reference: 1, and 0 in a session that has none.
     """
-    constant = np.array([isinstance(term, Constant) for term in terms])
+    constant = np.array([isinstance(term, ConstantTerm) for term in terms])
     has_reference = np.unique(observations.session[observations.of(Role.REFERENCE)])
     relative, first = found.copy(), np.zeros(len(terms))
     for index in np.unique(observations.session[against]):

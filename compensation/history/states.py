@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class ThermalMemory:
     """What a model needs remembered: lags and plays (compensation/expression.py), each after those it is made of.
     self_heating_K: of a camera over the air that has been on for long."""
 
@@ -49,13 +49,13 @@ class States:
     """A camera's thermal state at F instants. rows (F, 3 + P + 2): camera, air and supply, the P lags and plays of
     `memory`, then on_s and settled_s. NaN where unknown."""
 
-    memory: Memory
+    memory: ThermalMemory
     rows: Float
 
     @classmethod
-    def at_degC(cls, camera_degC: float | Float, count: int, memory: Memory | None = None) -> States:
+    def at_degC(cls, camera_degC: float | Float, count: int, memory: ThermalMemory | None = None) -> States:
         """Nothing but the camera's temperature is known, one or (F,), at `count` instants."""
-        memory = memory or Memory()
+        memory = memory or ThermalMemory()
         rows = np.full((count, len(memory.at) + 2), np.nan)
         rows[:, 0] = camera_degC
         return cls(memory, rows)
@@ -90,7 +90,7 @@ class States:
         return States(self.memory, self.rows[rows])
 
 
-def state_of(memory: Memory) -> ThermalState:
+def state_of(memory: ThermalMemory) -> ThermalState:
     """A camera's thermal state that remembers this, before its first sample."""
     return ThermalState(memory.parts, memory.self_heating_K)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.expression import AIR, POWER, lag
-from thermostand.compensation.history.states import Float, Memory, States, row_of, state_of
+from thermostand.compensation.history.states import Float, States, ThermalMemory, row_of, state_of
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepState
@@ -37,7 +37,7 @@ _AMBIENT, _POWER = "thermometers.air", "relays.camera_power"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class History:
+class ThermalHistory:
     """One session's record: instants, ns, ascending, and values; without readings that are BAD or in doubt.
 
     ambient_degC: of the air near the camera. powered: 0 or 1, until the next instant. camera_degC: its own reading,
@@ -58,11 +58,11 @@ class History:
         return len(self.ambient_ns) > 1
 
 
-def recorded_history(session: Session, until_ns: int | None = None) -> History:
+def recorded_history(session: Session, until_ns: int | None = None) -> ThermalHistory:
     """What the session's telemetry has of it, to that instant or its end; a channel that was not recorded is empty."""
     columns = (_good(session, _AMBIENT), _powered(session), _good(session, f"{session.camera}.temperature"))
     ambient, powered, camera = columns if until_ns is None else (_until(column, until_ns) for column in columns)
-    return refined(History(*ambient, *powered, *camera))
+    return refined(ThermalHistory(*ambient, *powered, *camera))
 
 
 def _until(column: tuple[TimesNs, Float], until_ns: int) -> tuple[TimesNs, Float]:
@@ -70,7 +70,7 @@ def _until(column: tuple[TimesNs, Float], until_ns: int) -> tuple[TimesNs, Float
     return column[0][known], column[1][known]
 
 
-def refined(history: History) -> History:
+def refined(history: ThermalHistory) -> ThermalHistory:
     """With the camera's temperature between the steps of its display.
 
     Many cameras show theirs in quarters of a degree, at which the image moves by several mpx. Where the display changes
@@ -83,7 +83,7 @@ def refined(history: History) -> History:
         return history
     shown, seconds = history.camera_degC, (history.camera_ns - history.camera_ns[0]) / NS_PER_S
     lags = [lag(of, tau_s) for of in (AIR, POWER) for tau_s in _SHAPE_TAUS_S]
-    states = states_at(history, Memory(tuple(lags)), history.camera_ns, shown)
+    states = states_at(history, ThermalMemory(tuple(lags)), history.camera_ns, shown)
     ambient = interpolated(history.ambient_ns, history.ambient_degC, history.camera_ns, GAP_NS)
     terms = np.column_stack([np.ones(len(shown)), ambient, states.of(lags)])
     known = np.isfinite(terms).all(axis=1)
@@ -137,7 +137,7 @@ def _powered(session: Session) -> tuple[TimesNs, Float]:
     return times_ns[order], values[order]
 
 
-def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: Float) -> States:
+def states_at(history: ThermalHistory, memory: ThermalMemory, time_ns: TimesNs, camera_degC: Float) -> States:
     """The thermal states at instants (F,), ascending, ns, at which the camera had these temperatures (F,).
 
     Those that were asked for last are kept, since a fit and its report ask for the same several times: not to be
@@ -148,7 +148,7 @@ def states_at(history: History, memory: Memory, time_ns: TimesNs, camera_degC: F
 
 
 @lru_cache(maxsize=8)
-def _rows_at(history: History, memory: Memory, times: bytes, temperatures: bytes) -> Float:
+def _rows_at(history: ThermalHistory, memory: ThermalMemory, times: bytes, temperatures: bytes) -> Float:
     time_ns, camera_degC = np.frombuffer(times, np.int64), np.frombuffer(temperatures, np.float64)
     rows = States.at_degC(camera_degC, len(time_ns), memory).rows
     if history.has_ambient and len(time_ns) and time_ns[-1] > history.ambient_ns[0]:
@@ -163,7 +163,7 @@ def _rows_at(history: History, memory: Memory, times: bytes, temperatures: bytes
     return rows
 
 
-def _followed(memory: Memory, inputs: Float, after: NDArray[np.intp]) -> Float:
+def _followed(memory: ThermalMemory, inputs: Float, after: NDArray[np.intp]) -> Float:
     """The state's row after so many (F,) of the samples (dt, ambient, power, camera); NaN after none."""
     state, wanted = state_of(memory), set(after.tolist())
     rows = {0: row_of(state)}
@@ -174,7 +174,7 @@ def _followed(memory: Memory, inputs: Float, after: NDArray[np.intp]) -> Float:
     return np.array([rows[number] for number in after.tolist()])
 
 
-def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
+def _camera(history: ThermalHistory, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
     """The camera's temperature at the marks, NaN where it is unknown: at the frames the one recorded with them, refined
     within the display's step by the whole record."""
     camera = interpolated(history.camera_ns, history.camera_degC, marks_ns, GAP_NS)
@@ -186,14 +186,14 @@ def _camera(history: History, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: 
     return camera
 
 
-def _means(history: History, marks_ns: TimesNs) -> tuple[Float, Float]:
+def _means(history: ThermalHistory, marks_ns: TimesNs) -> tuple[Float, Float]:
     """Mean ambient, by the trapezoidal rule, and powered share between the marks (M,), (M - 1,) each; NaN where the
     they are not recorded."""
     ambient = interpolated(history.ambient_ns, history.ambient_degC, marks_ns, GAP_NS)
     return (ambient[1:] + ambient[:-1]) / 2, _powered_share(history, marks_ns)
 
 
-def _powered_share(history: History, marks_ns: TimesNs) -> Float:
+def _powered_share(history: ThermalHistory, marks_ns: TimesNs) -> Float:
     """Exact means of the supply. A camera that reports its temperature is on where the relay was not recorded."""
     if len(history.powered_ns) == 0:
         return np.ones(len(marks_ns) - 1)

@@ -38,9 +38,9 @@ from thermostand.compensation.drift.unrepeated import Unrepeated, find_unrepeate
 from thermostand.compensation.expression import SPAN_K
 from thermostand.compensation.observations import Float, Mask, Observations
 from thermostand.compensation.reporting.equipment import Line, stated
-from thermostand.compensation.reporting.tracks import WarmUp, warm_ups
+from thermostand.compensation.reporting.tracks import WarmUpTrack, warm_ups
 from thermostand.compensation.validation3d.document import as_json as validation_json
-from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.experiments.steps import Role
 from thermostand.foundation.items import StepMark
 from thermostand.foundation.json_values import plain
@@ -213,7 +213,7 @@ class Extras:
 
     budgets: Mapping[str, Budget] = field(default_factory=dict[str, Budget])
     positions: TablePositions = field(default_factory=TablePositions)
-    validation: Validation | None = None
+    validation: SpatialValidation | None = None
     equipment: Sequence[Line] = ()
     details: Details = field(default_factory=Details)
 
@@ -317,7 +317,7 @@ def _unusable(observations: Observations) -> Iterator[UnusableFrames]:
             yield UnusableFrames(facts.session_id, reason, tuple(frames))
 
 
-def _warm_up(observations: Observations, one: WarmUp, model: DriftModel | None) -> WarmUpNumbers:
+def _warm_up(observations: Observations, one: WarmUpTrack, model: DriftModel | None) -> WarmUpNumbers:
     track = one.track
     camera_degC = observations.camera_degC[track.frames]
     mean = track.mean_px[np.isfinite(track.mean_px).all(axis=1)]
@@ -335,7 +335,7 @@ def _warm_up(observations: Observations, one: WarmUp, model: DriftModel | None) 
     )
 
 
-def _left_px(observations: Observations, one: WarmUp, model: DriftModel) -> Pair:
+def _left_px(observations: Observations, one: WarmUpTrack, model: DriftModel) -> Pair:
     """NaN for a camera that stood differently at the reference, and where the model has no answer."""
     frames = np.zeros(len(observations.frame), bool)
     frames[one.track.frames] = True

@@ -21,7 +21,7 @@ from thermostand.compensation.reporting.drawing.drawing import Draw, one_by_one
 from thermostand.compensation.reporting.numbers import compact, measured, percent, significant, typeset
 from thermostand.compensation.validation3d import paper
 from thermostand.compensation.validation3d.document import flagged, reason_names, with_limit
-from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.foundation.errors import ConfigError
 
 NamedFigure = tuple[str, Figure]
@@ -78,7 +78,7 @@ def _counts(found: Mapping[str, int], *written: str) -> str:
     return ", ".join(f"{count} {name.replace(*written) if written else name}" for name, count in found.items())
 
 
-def _reasons(validation: Validation) -> list[str]:
+def _reasons(validation: SpatialValidation) -> list[str]:
     return reason_names(Outside(int(np.bitwise_or.reduce(validation.flags, axis=None))))
 
 

@@ -9,15 +9,15 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby
 
-from thermostand.compensation.calibration.calibrate import Calibration
+from thermostand.compensation.calibration.calibrate import CameraCalibration
 from thermostand.compensation.calibration.camera_file import CameraFile
 from thermostand.compensation.datasheet.datasheet import Datasheet
-from thermostand.compensation.datasheet.quantity import COVERAGE, Quantity
+from thermostand.compensation.datasheet.quantity import COVERAGE, MeasuredQuantity
 from thermostand.compensation.reporting.drawing import calibration_figures, datasheet_figures
 from thermostand.compensation.reporting.drawing.validation_figures import bars, by_position
 from thermostand.compensation.reporting.equipment import Line, stated
 from thermostand.compensation.reporting.page import NamedFigure, page
-from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validate import SpatialValidation
 
 FORMAT = "thermostand datasheet 1"
 _LIBRARIES = ("thermostand", "numpy", "scipy", "opencv-python-headless")
@@ -70,7 +70,7 @@ def datasheet_json(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
     return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def _plain(one: Quantity) -> dict[str, object]:
+def _plain(one: MeasuredQuantity) -> dict[str, object]:
     return {
         "key": one.key,
         "name": one.name,
@@ -113,7 +113,7 @@ def _versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in _LIBRARIES}
 
 
-def calibration_page(file: CameraFile, calibration: Calibration) -> str:
+def calibration_page(file: CameraFile, calibration: CameraCalibration) -> str:
     """As HTML text; the same data give the same text."""
     drawn = {
         "residuals": calibration_figures.residual_vectors,
@@ -128,13 +128,13 @@ def calibration_page(file: CameraFile, calibration: Calibration) -> str:
     return page("calibration", f"Calibration of camera {file.camera_serial}", figures, file=file)
 
 
-def validation_page(validation: Validation) -> str:
+def validation_page(validation: SpatialValidation) -> str:
     """As HTML text; the same validation gives the same text."""
     title = f"Validation of {validation.session_id} in three dimensions"
     return page("validation", title, validation_figures(validation), validation=validation)
 
 
-def validation_figures(validation: Validation) -> Iterator[NamedFigure]:
+def validation_figures(validation: SpatialValidation) -> Iterator[NamedFigure]:
     """Of that page, and of a report's part."""
     yield "bars", bars(validation)
     for number, one in enumerate(variant for variant in (validation.after, validation.with_stand) if variant):

@@ -23,7 +23,7 @@ from thermostand.compensation.reporting.numbers import Extras, Numbers, as_json,
 from thermostand.compensation.reporting.page import NamedFigure, orientation, page
 from thermostand.compensation.reporting.pages import validation_figures
 from thermostand.compensation.reporting.tracks import Track, cycle, moved_px, visits, warm_ups
-from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import check_writable, write_whole
@@ -142,7 +142,7 @@ def _page(
 def page_of(
     numbers: Numbers,
     drawn: Iterable[NamedFigure] = (),
-    validation: Validation | None = None,
+    validation: SpatialValidation | None = None,
     draw: Draw = one_by_one,
     *,
     has_spots: bool = False,

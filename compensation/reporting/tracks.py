@@ -47,7 +47,7 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WarmUp:
+class WarmUpTrack:
     """A track from the first frame on. since_on_s (F,): since the camera was switched on; since the first frame when
     that is not recorded, and `power_on_known` is False."""
 
@@ -57,7 +57,7 @@ class WarmUp:
 
 
 @dataclass(frozen=True, slots=True)
-class Visit:
+class CycleVisit:
     """Frames at one set-point that follow each other. mean_px (I, J): mean drift. direction: 1 when reached from below,
     -1 from above, 0 the first of all."""
 
@@ -105,7 +105,7 @@ def _from_own_first(centres: Float) -> tuple[Float, Float]:
     return start, centres - start
 
 
-def warm_ups(observations: Observations) -> tuple[WarmUp, ...]:
+def warm_ups(observations: Observations) -> tuple[WarmUpTrack, ...]:
     """Each warm-up, from its own first frame."""
     return tuple(_warm_up(observations, frames) for frames in _warm_up_frames(observations))
 
@@ -116,7 +116,7 @@ def _warm_up_frames(observations: Observations) -> Iterator[Rows]:
         yield np.array(list(group), np.int64)
 
 
-def _warm_up(observations: Observations, frames: Rows) -> WarmUp:
+def _warm_up(observations: Observations, frames: Rows) -> WarmUpTrack:
     session = int(observations.session[frames[0]])
     start, moved = _from_own_first(observations.centres_px[frames])
     times_ns = observations.time_ns[frames]
@@ -124,7 +124,7 @@ def _warm_up(observations: Observations, frames: Rows) -> WarmUp:
     since_ns = times_ns - (int(times_ns[0]) if on_ns is None else on_ns)
     at_reference = _is_near(start - reference_centres(observations)[0][session])
     track = Track(session, frames, start, moved, _roll_deg(observations, start), at_reference)
-    return WarmUp(track, since_ns / _NS_PER_S, on_ns is not None)
+    return WarmUpTrack(track, since_ns / _NS_PER_S, on_ns is not None)
 
 
 def _roll_deg(observations: Observations, start_px: Float) -> float:
@@ -148,9 +148,9 @@ def cycle(observations: Observations, session: int) -> Track | None:
     return Track(session, frames, start, observations.centres_px[frames] - start, _roll_deg(observations, start), True)
 
 
-def visits(observations: Observations, track: Track) -> tuple[Visit, ...]:
+def visits(observations: Observations, track: Track) -> tuple[CycleVisit, ...]:
     """The set-points of a cycle in order of time."""
-    found: list[Visit] = []
+    found: list[CycleVisit] = []
     mean = track.mean_px
     chamber = observations.chamber_degC[track.frames]
     for degC, group in groupby(range(len(track.frames)), key=lambda k: float(chamber[k])):
@@ -158,7 +158,7 @@ def visits(observations: Observations, track: Track) -> tuple[Visit, ...]:
         i, j = np.nanmean(mean[rows], axis=0).tolist() if np.isfinite(mean[rows]).any() else (math.nan, math.nan)
         direction = 0 if not found else (1 if degC > found[-1].chamber_degC else -1)
         camera_degC = float(observations.camera_degC[track.frames[rows]].mean())
-        found.append(Visit(degC, camera_degC, (i, j), direction))
+        found.append(CycleVisit(degC, camera_degC, (i, j), direction))
     return tuple(found)
 
 

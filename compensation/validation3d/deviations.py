@@ -32,7 +32,7 @@ class Doubts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class FoundPose:
     """place_mm (3,): of the target's middle. rotation (3, 3). noise, model, stand (6, 6): covariances of a small
     rotation (rad) and of the place (mm) by the markers' noise, the drift model, the stand's correction. chi: of Pose.
     """
@@ -45,7 +45,7 @@ class Found:
     chi: float
 
 
-def find(lens: Lens, board: Board, mean: MeanCentres, growth: float, doubts: Doubts, image_width_px: int) -> Found:
+def find(lens: Lens, board: Board, mean: MeanCentres, growth: float, doubts: Doubts, image_width_px: int) -> FoundPose:
     """Pose from mean centres, their covariances times `growth`. CalibrationError when the markers give no pose."""
     covariance_px2 = mean.covariance_px2 * growth
     pose = find_pose(lens, board, mean.centres_px, covariance_px2)
@@ -60,7 +60,7 @@ def find(lens: Lens, board: Board, mean: MeanCentres, growth: float, doubts: Dou
         moved = doubts.errors_px[:, seen].reshape(len(doubts.errors_px), -1) @ gain.T
         stand = moved.T @ moved
     noise = about_middle @ pose.covariance @ about_middle.T
-    return Found(pose.place_mm(middle_mm(board)), pose.rotation, noise, model, stand, pose.chi)
+    return FoundPose(pose.place_mm(middle_mm(board)), pose.rotation, noise, model, stand, pose.chi)
 
 
 def middle_mm(board: Board) -> Float:
@@ -68,7 +68,7 @@ def middle_mm(board: Board) -> Float:
     return (board.points_mm.min(axis=0) + board.points_mm.max(axis=0)) / 2
 
 
-def rotation_mrad(found: Found, reference: Found) -> Float:
+def rotation_mrad(found: FoundPose, reference: FoundPose) -> Float:
     """The rotation vector (3,) from the reference's orientation, about the camera's axes."""
     return 1e3 * Rotation.from_matrix(found.rotation @ reference.rotation.T).as_rotvec()
 
@@ -102,7 +102,7 @@ _LEAST_MARKERS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Camera:
+class CalibratedCamera:
     """The calibrated camera and target, and what the lens model is called."""
 
     lens: Lens
@@ -170,7 +170,7 @@ class Deviations:
 
 def deviations(
     name: str,
-    camera: Camera,
+    camera: CalibratedCamera,
     observations: Observations,
     frames: ValidationFrames,
     centres_px: Float,
@@ -187,7 +187,7 @@ def deviations(
     chi = scatter_chi([mean for row in means for mean in row if mean is not None])
     growth = 1.0 if np.isnan(chi) else max(1.0, chi) ** 2
     width = observations.image_size[0]
-    grid: list[list[Found | None]] = []
+    grid: list[list[FoundPose | None]] = []
     for row, indices in zip(means, frames.frames, strict=True):
         grid.append([])
         for mean, chosen in zip(row, indices, strict=True):
@@ -212,7 +212,7 @@ def _averaged(observations: Observations, centres_px: Float, indices: FrameIndic
     return mean
 
 
-def _compared(name: str, names: tuple[str, ...], grid: list[list[Found | None]]) -> Deviations:
+def _compared(name: str, names: tuple[str, ...], grid: list[list[FoundPose | None]]) -> Deviations:
     count = len(names)
     reference = [found for found in grid[0][:count] if found is not None]
     if len(reference) < count:
@@ -247,7 +247,7 @@ class _Apart:
     u_mrad: Float
 
 
-def _apart(found: Found | None, other: Found | None) -> _Apart:
+def _apart(found: FoundPose | None, other: FoundPose | None) -> _Apart:
     """What the drift model leaves unexplained counts twice, at the reference as well; the stand's correction is nothing
     there, and its errors count once."""
     if found is None or other is None:

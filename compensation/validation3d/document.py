@@ -16,13 +16,13 @@ from thermostand.compensation.drift.drift_model import Outside
 from thermostand.compensation.observations import Float
 from thermostand.compensation.validation3d.deviations import Deviations
 from thermostand.compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.foundation.documents import Document, load_json
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.json_values import plain
 
 
-def summary(validation: Validation) -> str:
+def summary(validation: SpatialValidation) -> str:
     """Mean absolute deviation along X, Y, Z with its standard uncertainty, for every variant; rotation and table."""
     width = max(len(one.name) for one in validation.variants) + 2
     where = " (simulated)" if validation.simulated else ""
@@ -50,7 +50,7 @@ def with_limit(value_um: float, u_um: float) -> str:
     return f"{value_um:.2f} (u ≤ {u_um:.2f})"
 
 
-def flagged(validation: Validation) -> str:
+def flagged(validation: SpatialValidation) -> str:
     """What of the corrections was beyond the model's valid range, and why."""
     reasons = Outside(int(np.bitwise_or.reduce(validation.flags[np.isfinite(validation.outside)], axis=None)))
     share = float(np.nanmean(validation.outside))
@@ -136,7 +136,7 @@ class _File(Document):
     results: Annotated[tuple[_Result, ...], Field(min_length=2, max_length=4)]
 
 
-def as_json(validation: Validation) -> str:
+def as_json(validation: SpatialValidation) -> str:
     """The document's text."""
     places = zip(validation.names, validation.linear_mm, validation.rotary_deg, validation.distance_mm, strict=True)
     document = {
@@ -164,7 +164,7 @@ def _result(one: Deviations) -> dict[str, Any]:
     return {name: getattr(one, attribute_of.get(name, name)) for name in _Result.model_fields}
 
 
-def load_validation(path: Path) -> Validation:
+def load_validation(path: Path) -> SpatialValidation:
     """The validation in a file of `compensate validate`; SessionError when it is anything else."""
     file = load_json(path, lambda text: _File.model_validate_json(text, strict=True), "a validation")
     try:
@@ -173,11 +173,11 @@ def load_validation(path: Path) -> Validation:
         raise SessionError(f"{path}: not a validation of this program (its arrays do not fit: {error})") from error
 
 
-def _validation(file: _File) -> Validation:
+def _validation(file: _File) -> SpatialValidation:
     shape = (len(file.chamber_degC), len(file.positions))
     before, after, *others = (_deviations(one, shape) for one in file.results)
     camera_alone, with_stand = (*others, None, None)[:2]
-    return Validation(
+    return SpatialValidation(
         names=tuple(one.name for one in file.positions),
         linear_mm=np.array([one.linear_mm for one in file.positions]),
         rotary_deg=np.array([one.rotary_deg for one in file.positions]),

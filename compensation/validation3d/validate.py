@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.budget.budget import displacement_px, mean_state, states_at, varied
-from thermostand.compensation.budget.geometry import Geometry, Quantity, StandTemperatures
+from thermostand.compensation.budget.geometry import Geometry, StandState, UncertainValue
 from thermostand.compensation.calibration.camera_file import CameraFile
 from thermostand.compensation.calibration.model_scores import ray_name
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.observations import Float, Observations
-from thermostand.compensation.validation3d.deviations import Camera, Deviations, deviations
+from thermostand.compensation.validation3d.deviations import CalibratedCamera, Deviations, deviations
 from thermostand.compensation.validation3d.validation_frames import ValidationFrames
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.reading.session import Session
@@ -67,8 +67,8 @@ def stand_part(
     return StandPart(here[0], excess[0], here[1:] - here[0], excess[1:] - excess[0])
 
 
-def _check_known(session: Session, states: list[StandTemperatures]) -> None:
-    for name in StandTemperatures.__dataclass_fields__:
+def _check_known(session: Session, states: list[StandState]) -> None:
+    for name in StandState.__dataclass_fields__:
         if not all(math.isfinite(getattr(state, name)) for state in states):
             silent = name.removesuffix("_degC")
             raise SessionError(
@@ -77,13 +77,11 @@ def _check_known(session: Session, states: list[StandTemperatures]) -> None:
             )
 
 
-def _moved(geometry: Geometry, distance_mm: float) -> Quantity:
-    return Quantity(value=distance_mm, u=geometry.distance_mm.u)
+def _moved(geometry: Geometry, distance_mm: float) -> UncertainValue:
+    return UncertainValue(value=distance_mm, u=geometry.distance_mm.u)
 
 
-def _displacements_px(
-    state: StandTemperatures, reference: StandTemperatures, geometry: Geometry, centres_px: Float
-) -> Float:
+def _displacements_px(state: StandState, reference: StandState, geometry: Geometry, centres_px: Float) -> Float:
     """(1 + V, N, 2): nominal, and with each uncertain input larger in turn."""
     inputs = [(state, geometry), *varied(state, geometry)]
     return np.array([displacement_px(each, reference, stand, centres_px) for each, stand in inputs])
@@ -101,7 +99,7 @@ class LensModel(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Validation:
+class SpatialValidation:
     """T temperatures, the first is the reference, P positions.
 
     names, linear_mm, rotary_deg, distance_mm (P,): V0, V1, ... at the reference. chamber_degC, camera_degC (T,).
@@ -134,13 +132,13 @@ class Validation:
         return tuple(one for one in (self.before, self.after, self.camera_alone, self.with_stand) if one is not None)
 
 
-def camera_of(file: CameraFile, lens: LensModel) -> Camera:
+def camera_of(file: CameraFile, lens: LensModel) -> CalibratedCamera:
     """The calibrated camera and target of a camera file; CalibrationError when it has no ray model, and that is
     asked for."""
     if lens is LensModel.PINHOLE:
-        return Camera(file.lens, file.model, file.adjusted_board)
+        return CalibratedCamera(file.lens, file.model, file.adjusted_board)
     rays = file.ray_lens
-    return Camera(rays, ray_name(rays.degree), file.adjusted_board)
+    return CalibratedCamera(rays, ray_name(rays.degree), file.adjusted_board)
 
 
 def check_same(observations: Observations, file: CameraFile, model: DriftModel) -> None:
@@ -159,10 +157,10 @@ def check_same(observations: Observations, file: CameraFile, model: DriftModel) 
 def validate(
     observations: Observations,
     frames: ValidationFrames,
-    camera: Camera,
+    camera: CalibratedCamera,
     model: DriftModel,
     stand_at: StandAt = lambda _: None,
-) -> Validation:
+) -> SpatialValidation:
     """SessionError when the model has no answer for any frame. CalibrationError when the reference has no pose."""
     compensated = corrected(observations, frames, model)
     if not np.isfinite(compensated.centres_px).any():
@@ -174,7 +172,7 @@ def validate(
     distance_mm = _distances_mm(observations, frames, camera)
     alone, with_stand = _stand_variants(observations, frames, camera, compensated, stand_at(distance_mm))
     outside, flags = _outside(frames, compensated, len(frames.names))
-    return Validation(
+    return SpatialValidation(
         names=frames.names,
         linear_mm=frames.linear_mm,
         rotary_deg=frames.rotary_deg,
@@ -200,7 +198,7 @@ def _named(what: tuple[str, str, tuple[int, int]]) -> str:
     return f"camera {serial}, target {target}, {width} x {height} px"
 
 
-def _distances_mm(observations: Observations, frames: ValidationFrames, camera: Camera) -> Float:
+def _distances_mm(observations: Observations, frames: ValidationFrames, camera: CalibratedCamera) -> Float:
     """(P,): of the target's middle along Z, in the first frame of each position."""
     middle = camera.middle_mm
     first = [indices[0] for indices in frames.frames[0][:-1]]
@@ -214,7 +212,7 @@ def _distances_mm(observations: Observations, frames: ValidationFrames, camera: 
 def _stand_variants(
     observations: Observations,
     frames: ValidationFrames,
-    camera: Camera,
+    camera: CalibratedCamera,
     compensated: Corrected,
     stand: StandPart | None,
 ) -> tuple[Deviations | None, Deviations | None]:

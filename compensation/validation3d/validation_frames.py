@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.calibration.session_centres import Visit, place, visits_for
+from thermostand.compensation.calibration.session_centres import TableVisit, place, visits_for
 from thermostand.compensation.observations import Float, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
@@ -73,7 +73,7 @@ def _frames_of(observations: Observations) -> dict[str, FrameIndices]:
 
 
 def _temperatures(
-    visits: dict[str, Visit], seen: dict[str, FrameIndices], chamber_degC: Float
+    visits: dict[str, TableVisit], seen: dict[str, FrameIndices], chamber_degC: Float
 ) -> list[tuple[float, list[str]]]:
     """Set-point and the steps seen at it, in order; going back to a set-point is another temperature."""
     known = [step_id for step_id in visits if step_id in seen]
@@ -83,7 +83,7 @@ def _temperatures(
 
 
 def _row(
-    visits: dict[str, Visit], seen: dict[str, FrameIndices], steps: list[str], places: list[tuple[float, float]]
+    visits: dict[str, TableVisit], seen: dict[str, FrameIndices], steps: list[str], places: list[tuple[float, float]]
 ) -> tuple[FrameIndices, ...]:
     """The frames at each place, and of the return to the first."""
     found = {(_sent(visits[step_id]), visits[step_id].role): seen[step_id] for step_id in steps}
@@ -92,7 +92,7 @@ def _row(
     return (*posed, found.get((places[0], str(Role.REPEATABILITY)), nothing))
 
 
-def _check_seen_at_reference(session: Session, visits: dict[str, Visit], at: list[str]) -> None:
+def _check_seen_at_reference(session: Session, visits: dict[str, TableVisit], at: list[str]) -> None:
     known = {_sent(visits[step_id]) for step_id in at}
     for visit in visits.values():
         if _sent(visit) not in known:
@@ -103,5 +103,5 @@ def _check_seen_at_reference(session: Session, visits: dict[str, Visit], at: lis
             )
 
 
-def _sent(visit: Visit) -> tuple[float, float]:
+def _sent(visit: TableVisit) -> tuple[float, float]:
     return visit.sent["linear"], visit.sent["rotary"]

@@ -8,7 +8,7 @@ from typing import Self, cast
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from thermostand.experiments.calibration import Calibration, calibration
+from thermostand.experiments.calibration import CalibrationGrid, calibration
 from thermostand.experiments.sequence import checked
 from thermostand.experiments.steps import PlannedStep, Situation, Step, number_steps
 from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
@@ -34,7 +34,7 @@ class Experiment(Document):
 
     warm_up: WarmUp | None = None
     thermal_cycle: ThermalCycle | None = None
-    calibration: Calibration | None = None
+    calibration: CalibrationGrid | None = None
     validation: Validation | None = None
     steps: StepEntries | None = Field(default=None, min_length=1)
     _added: tuple[str, tuple[Step, ...]] = PrivateAttr(("", ()))

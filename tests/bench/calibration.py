@@ -23,7 +23,7 @@ from thermostand.compensation.calibration.centre_corrections import shifts_by_ho
 from thermostand.compensation.calibration.model_scores import halves, rays_of
 from thermostand.compensation.calibration.pinhole import OpencvCalibration, calibrate_opencv
 from thermostand.compensation.calibration.session_centres import Positions
-from thermostand.compensation.calibration.stage_geometry import Table, TableSigma
+from thermostand.compensation.calibration.stage_geometry import TableGeometry, TableSigma
 
 SEEDS = range(6)
 ROUNDS = 3
@@ -69,7 +69,7 @@ class _Case:
         return translation_errors_um(self.laboratory, lens, adjusted.adjusted_board, adjusted.scene.table)
 
     def peer_errors_um(self) -> Float:
-        table: Table = table_from_poses(
+        table: TableGeometry = table_from_poses(
             self.seen.linear_mm, self.seen.rotary_deg, self.peer.rotations, self.peer.translations_mm, CENTRE_mm
         )
         return translation_errors_um(self.laboratory, self.peer.lens, self.board, table)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from thermostand.compensation.calibration.board import Board, board_of
 from thermostand.compensation.calibration.pose import Lens, find_pose
 from thermostand.compensation.calibration.session_centres import Positions
-from thermostand.compensation.calibration.stage_geometry import Table
+from thermostand.compensation.calibration.stage_geometry import TableGeometry
 from thermostand.markers.target import Target
 
 from .calibration_truth import SIZE, Laboratory, true_table_frame
@@ -46,7 +46,7 @@ def covariances(laboratory: Laboratory) -> Float:
     return np.tile(laboratory.covariance_px2, (54, 1, 1))
 
 
-def translation_errors_um(laboratory: Laboratory, lens: Lens, known: Board, table: Table) -> Float:
+def translation_errors_um(laboratory: Laboratory, lens: Lens, known: Board, table: TableGeometry) -> Float:
     """(3, 3): V0 -> V1, V2, V3 of the target's centre in the table's frame, found minus true, X Y Z in um."""
     poses = [find_pose(lens, known, centres, covariances(laboratory)) for centres in laboratory.validation_px]
     found = np.array([pose.place_mm(CENTRE_mm) for pose in poses]) @ table.frame.T

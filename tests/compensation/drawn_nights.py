@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.history.thermal_history import History, refined
+from thermostand.compensation.history.thermal_history import ThermalHistory, refined
 from thermostand.compensation.observations import Observations
 
 from .drawn_cameras import (
@@ -185,7 +185,7 @@ def _observations(
     switched = np.flatnonzero((np.diff(plan.powered, prepend=np.nan) != 0) | (np.arange(len(times_ns)) == before))
     switched = switched[switched >= before]
     supply = times_ns[switched] - STEP_S * NS_PER_S, plan.powered[switched]
-    history = History(times_ns[since], near[since], *supply, times_ns[on & since], stated[on & since])
+    history = ThermalHistory(times_ns[since], near[since], *supply, times_ns[on & since], stated[on & since])
     return Observations(
         target=TARGET,
         sessions=(replace(facts(session_id), simulated=True),),

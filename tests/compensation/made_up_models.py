@@ -12,7 +12,7 @@ from thermostand.compensation.drift.terms import (
     AmbientLagCubed,
     AmbientLagSquared,
     CameraLag,
-    Constant,
+    ConstantTerm,
     OfCamera,
     OfCameraSquared,
     OfPartPlay,
@@ -54,7 +54,7 @@ def paper(degree: int = 3) -> PaperModel:
 def thermal(*, warmed: bool = True) -> ThermalModel:
     """With a term of every kind."""
     terms = (
-        *(Constant(), OfCamera(), OfCameraSquared()),
+        *(ConstantTerm(), OfCamera(), OfCameraSquared()),
         *(AmbientLag(tau_s=tau_s) for tau_s in (600.0, 3600.0)),
         *(AmbientLagSquared(tau_s=3600.0), AmbientLagCubed(tau_s=3600.0), CameraLag(tau_s=600.0)),
         *(OfPlay(radius_K=6.0), OfPlay(radius_K=3.0)),

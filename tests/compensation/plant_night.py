@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.history.thermal_history import History, refined
+from thermostand.compensation.history.thermal_history import ThermalHistory, refined
 from thermostand.compensation.observations import Observations, SessionFacts
 from thermostand.drivers.camera_preset import CameraPreset, Effect
 from thermostand.drivers.sim.physics.optics import CameraKind, true_centres_px
@@ -177,7 +177,7 @@ class Night:
             reasons=("",) * count,
             histories=(
                 refined(
-                    History(
+                    ThermalHistory(
                         *(np.array([time_ns for time_ns, _ in log.air], np.int64), air[:, 1]),
                         *(np.array([time_ns for time_ns, _ in log.powered], np.int64), powered[:, 1]),
                         *(np.array([time_ns for time_ns, _ in log.camera], np.int64), stated[:, 1]),

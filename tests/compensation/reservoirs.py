@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.history.thermal_history import History
+from thermostand.compensation.history.thermal_history import ThermalHistory
 from thermostand.compensation.observations import Observations
 
 from .synthetic import SIZE, TARGET, facts
@@ -99,7 +99,7 @@ def session(
         covariance_px2=np.tile(np.eye(2) * NOISE_PX**2, (count, 54, 1, 1)),
         flags=np.zeros((count, 54), np.uint8),
         reasons=("",) * count,
-        histories=(History(times_ns, air_degC, times_ns[:-1], powered[1:], times_ns[on], stated[on]),),
+        histories=(ThermalHistory(times_ns, air_degC, times_ns[:-1], powered[1:], times_ns[on], stated[on]),),
     )
     return found, truth
 

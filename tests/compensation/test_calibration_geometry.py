@@ -8,7 +8,7 @@ import pytest
 
 from thermostand.compensation.calibration.adjustment import table_from_poses
 from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.bundle import Problem, Scene, problem_of
+from thermostand.compensation.calibration.bundle import Problem, TableScene, problem_of
 from thermostand.compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise
 from thermostand.compensation.calibration.pinhole import Pinhole, across
@@ -92,7 +92,7 @@ def test_directions_across_an_axis_are_at_right_angles():
     assert np.abs(frame.T @ frame - np.eye(3)).max() < 1e-12
 
 
-def written_out(problem: Problem, scene: Scene) -> Float:
+def written_out(problem: Problem, scene: TableScene) -> Float:
     """The derivatives of all residuals of the adjustment, nearly all of them zeros."""
     slopes, count, free = problem.slopes(scene), len(problem.position), int(problem.freed.sum())
     lens, first_error = len(scene.lens.vector), slopes.common.shape[2]
@@ -122,7 +122,7 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
     random = np.random.default_rng(1)
     errors = random.standard_normal((9, 6)) * (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5)
     known = board(laboratory)
-    scene = Scene(RATIONAL, table, errors, known.points_mm)
+    scene = TableScene(RATIONAL, table, errors, known.points_mm)
     sigma = TableSigma(0.0005, 0.1, 0.001, 0.2)
     problem = problem_of(seen, np.zeros_like(seen.centres_px), seen.seen, known, sigma, 0.0, RATIONAL)
     jacobian, residuals = written_out(problem, scene), problem.residuals(scene)

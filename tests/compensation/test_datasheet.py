@@ -16,7 +16,7 @@ from thermostand.compensation.cli import app
 from thermostand.compensation.datasheet.datasheet import Datasheet, datasheet, frame_noise, warming_quantities
 from thermostand.compensation.datasheet.details import Details, load_details
 from thermostand.compensation.datasheet.motions import Visits, Warming, motions
-from thermostand.compensation.datasheet.quantity import NIGHTS, Contribution, Quantity, direct, pooled
+from thermostand.compensation.datasheet.quantity import NIGHTS, Contribution, MeasuredQuantity, direct, pooled
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.observations import Observations
@@ -114,7 +114,7 @@ def test_the_air_s_uncertainty_counts_in_what_depends_on_it():
 
 def test_several_nights_are_pooled_and_their_difference_is_a_contribution():
     lines = (direct("noise", "A", 0.3, "px", ""), Contribution("air", "B", 0.1, "K", 2.0, ""))
-    one = Quantity("k", "g", "n", "px", 1.0, "m", lines)
+    one = MeasuredQuantity("k", "g", "n", "px", 1.0, "m", lines)
     both = pooled([one, replace(one, value=1.2)])
     assert both.value == pytest.approx(1.1)
     a, b, nights = both.contributions

@@ -5,11 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermostand.compensation.design.forecast import Situation, Surroundings, after, at_rest, now, surroundings
-from thermostand.compensation.design.next_visit import Decision, Known, Wanted, best_course, decide, wanted_states
+from thermostand.compensation.design.forecast import (
+    CameraSurroundings,
+    ForecastState,
+    after,
+    at_rest,
+    now,
+    surroundings,
+)
+from thermostand.compensation.design.next_visit import Decision, DesignState, Wanted, best_course, decide, wanted_states
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.expression import AIR, CAMERA, lag, play
-from thermostand.compensation.history.states import Float, Memory
+from thermostand.compensation.history.states import Float, ThermalMemory
 from thermostand.compensation.observations import Observations
 
 from .drawn_cameras import drawn_camera
@@ -18,7 +25,7 @@ from .drawn_nights import Stretch, night, reference, warm_up
 WANTED = Wanted((10.0, 52.0), 0.005, held_out_degC=(20.0, 34.0))
 AIR_LAGS = [lag(AIR, tau_s) for tau_s in (480.0, 3000.0)]
 CAMERA_LAGS = [lag(CAMERA, tau_s) for tau_s in (480.0, 3000.0)]
-MEMORY = Memory((*AIR_LAGS, *CAMERA_LAGS, play(CAMERA, 5.0)))
+MEMORY = ThermalMemory((*AIR_LAGS, *CAMERA_LAGS, play(CAMERA, 5.0)))
 BEGUN = [*warm_up(), *reference()]
 VISITS = [Stretch(degC, 1500, "fit", 5) for degC in (52.0, 10.0, 45.0, 17.0, 31.0)]
 
@@ -59,14 +66,14 @@ def test_a_long_dwell_comes_to_rest(observed: Observations):
 
 
 def test_the_ends_of_the_range_teach_most_about_a_straight_line():
-    around = Surroundings(np.array([0.0, 1.0]), np.array([15.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 20.0)
+    around = CameraSurroundings(np.array([0.0, 1.0]), np.array([15.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 20.0)
     here = at_rest(around, np.array([24.0]), MEMORY)
 
-    def line(situation: Situation) -> Float:
+    def line(situation: ForecastState) -> Float:
         return np.column_stack([np.ones(len(situation.air_degC)), (situation.air_degC - 31.0) / 20.0])
 
     wanted = np.column_stack([np.ones(9), np.linspace(-1.0, 1.0, 9)])
-    known = Known(np.diag([1e-8, 1e-4]), 1e-6, wanted, line)
+    known = DesignState(np.diag([1e-8, 1e-4]), 1e-6, wanted, line)
     chosen = best_course(known, here, around, np.linspace(10.0, 52.0, 13), (14400.0,), seed=1)
     assert chosen.chamber_degC in (10.0, 52.0)
     assert chosen.variance_px2 < 1e-8 + 1e-4 / 20
@@ -74,13 +81,13 @@ def test_the_ends_of_the_range_teach_most_about_a_straight_line():
 
 def test_a_part_that_creeps_is_shown_by_staying():
     """At the end of eight hours at one end of the range it has gone further than on any way to and fro."""
-    around = Surroundings(np.array([0.0, 1.0]), np.array([15.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 20.0)
-    here = at_rest(around, np.array([31.0]), Memory((lag(AIR, 20000.0),)))
+    around = CameraSurroundings(np.array([0.0, 1.0]), np.array([15.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 20.0)
+    here = at_rest(around, np.array([31.0]), ThermalMemory((lag(AIR, 20000.0),)))
 
-    def creep(situation: Situation) -> Float:
+    def creep(situation: ForecastState) -> Float:
         return (situation.states.of([lag(AIR, 20000.0)]) - 31.0) / 20.0
 
-    known = Known(np.array([[1e-4]]), 1e-4, np.array([[1.0]]), creep)
+    known = DesignState(np.array([[1e-4]]), 1e-4, np.array([[1.0]]), creep)
     chosen = best_course(known, here, around, np.linspace(10.0, 52.0, 13), (7200.0,), seed=1)
     stayed = np.cumsum([7200.0] * 4)
     gone = [float(creep(after(around, here, np.array([52.0]), np.array([time_s])))[0, 0]) for time_s in stayed]

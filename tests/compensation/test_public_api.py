@@ -21,8 +21,8 @@ import thermostand
 from thermostand import compensation, markers, recording
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.expression import POWER, lag
-from thermostand.compensation.history.states import Memory
-from thermostand.compensation.history.thermal_history import History, states_at
+from thermostand.compensation.history.states import ThermalMemory
+from thermostand.compensation.history.thermal_history import ThermalHistory, states_at
 from thermostand.experiments.steps import Role
 
 from .conftest import Recorded
@@ -200,8 +200,8 @@ def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings(
     known: dict[str, Any] = {"air": air}
     told: dict[str, Any] = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
     slow = [lag(POWER, 1620.0)]
-    memory = Memory(tuple(slow))
-    history = History(*air, air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
+    memory = ThermalMemory(tuple(slow))
+    history = ThermalHistory(*air, air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
     truth = states_at(history, memory, air_ns[frames], own_degC[frames])
     model: Any = SimpleNamespace(memory=memory)
     found = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **told)

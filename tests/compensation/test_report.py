@@ -12,8 +12,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from thermostand.compensation.budget.budget import Budget, Contribution
-from thermostand.compensation.budget.geometry import StandTemperatures
+from thermostand.compensation.budget.budget import Budget, BudgetLine
+from thermostand.compensation.budget.geometry import StandState
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.drift.paper_model import PaperModel
@@ -37,11 +37,11 @@ from .synthetic import facts, observations, places_px, quadratic
 
 Analysed = tuple[Observations, PaperModel, Evaluation]
 BUDGET = Budget(
-    reference=StandTemperatures(24.01, 24.02, 24.03, 24.04, 24.05),
+    reference=StandState(24.01, 24.02, 24.03, 24.04, 24.05),
     air_degC=(10.5, 51.5),
     contributions=(
-        Contribution("granite along the axis", 25.17, 4.05, -0.04861, 0.00782, "the frame's corner", True),
-        Contribution("linear table, resolution", 0.31, float("nan"), 0.00047, float("nan"), "outermost", False),
+        BudgetLine("granite along the axis", 25.17, 4.05, -0.04861, 0.00782, "the frame's corner", True),
+        BudgetLine("linear table, resolution", 0.31, float("nan"), 0.00047, float("nan"), "outermost", False),
     ),
 )
 HEADINGS = (

@@ -14,7 +14,7 @@ from thermostand.compensation.reporting.numbers import Extras, TablePositions, n
 from thermostand.compensation.reporting.report import report_page
 from thermostand.compensation.validation3d.deviations import Deviations
 from thermostand.compensation.validation3d.document import as_json, load_validation
-from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark, StepState
 
@@ -44,8 +44,8 @@ def deviations(name: str, size_um: float, seed: int) -> Deviations:
 
 
 @pytest.fixture(scope="module")
-def validation() -> Validation:
-    return Validation(
+def validation() -> SpatialValidation:
+    return SpatialValidation(
         names=("V0", "V1"),
         linear_mm=np.array([70.0, 95.0]),
         rotary_deg=np.array([0.0, 8.0]),
@@ -66,7 +66,7 @@ def validation() -> Validation:
     )
 
 
-def written(validation: Validation, folder: Path) -> Path:
+def written(validation: SpatialValidation, folder: Path) -> Path:
     path = folder / "validation.json"
     path.write_text(as_json(validation))
     return path
@@ -85,7 +85,7 @@ def steps(moves: tuple[tuple[float, float], ...], role: str, prefix: str) -> lis
     return found
 
 
-def test_a_validation_is_read_back_as_it_was_written(validation: Validation, tmp_path: Path):
+def test_a_validation_is_read_back_as_it_was_written(validation: SpatialValidation, tmp_path: Path):
     alone = replace(
         validation, camera_alone=deviations("alone", 50.0, 3), with_stand=deviations("with the stand", 1.0, 4)
     )
@@ -107,7 +107,7 @@ def test_a_validation_is_read_back_as_it_was_written(validation: Validation, tmp
     ],
 )
 def test_another_file_is_refused_with_a_sentence(
-    validation: Validation, tmp_path: Path, key: str, value: object, complaint: str
+    validation: SpatialValidation, tmp_path: Path, key: str, value: object, complaint: str
 ):
     path = written(validation, tmp_path)
     path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
@@ -123,7 +123,7 @@ def test_no_file_and_no_json_are_refused_with_a_sentence(tmp_path: Path):
         load_validation(tmp_path / "page.html")
 
 
-def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validation: Validation):
+def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validation: SpatialValidation):
     night = observations(quadratic, 0.005)
     extras = Extras(positions=TablePositions(((0.0, 0.0), (90.0, 15.0)), PLACES), validation=validation)
     page = report_page(night, None, None, extras)

@@ -10,20 +10,20 @@ import pytest
 
 from thermostand.compensation.drift_runtime import ThermalState
 from thermostand.compensation.expression import AIR, CAMERA, POWER, lag, play
-from thermostand.compensation.history.states import Memory, States, row_of, state_of
-from thermostand.compensation.history.thermal_history import History, refined, states_at
+from thermostand.compensation.history.states import States, ThermalMemory, row_of, state_of
+from thermostand.compensation.history.thermal_history import ThermalHistory, refined, states_at
 
 S = 1_000_000_000
 TAUS_S = (600.0, 3600.0)
 AIR_LAGS, POWER_LAGS, CAMERA_LAGS = ([lag(of, tau_s) for tau_s in TAUS_S] for of in (AIR, POWER, CAMERA))
 PLAY = play(CAMERA, 2.0)
-MEMORY = Memory((*AIR_LAGS, *POWER_LAGS, *CAMERA_LAGS, PLAY), 20.0)
+MEMORY = ThermalMemory((*AIR_LAGS, *POWER_LAGS, *CAMERA_LAGS, PLAY), 20.0)
 STEP_AT_S, END_S = 3600, 4 * 3600
 
 
 def history(
     camera_excess_K: float = 20.0, gap: tuple[int, int] | None = None, resolution_K: float = 0.0, on_at_s: int = 0
-) -> History:
+) -> ThermalHistory:
     """The air steps from 24 to 34 degC after an hour, the camera follows at once with its excess."""
     times_s = np.arange(0, END_S + 1, 5)
     if gap is not None:
@@ -34,10 +34,10 @@ def history(
         stated = resolution_K * np.round(stated / resolution_K)
     on = times_s >= on_at_s
     powered_ns, powered = np.array([0, on_at_s], np.int64) * S, np.array([float(on_at_s == 0), 1.0])
-    return History(times_s * S, air, powered_ns, powered, times_s[on] * S, stated[on])
+    return ThermalHistory(times_s * S, air, powered_ns, powered, times_s[on] * S, stated[on])
 
 
-def at(record: History, *seconds: int, camera_degC: float = 54.0) -> States:
+def at(record: ThermalHistory, *seconds: int, camera_degC: float = 54.0) -> States:
     times_ns = np.array(seconds, np.int64) * S
     return states_at(record, MEMORY, times_ns, np.full(len(times_ns), camera_degC))
 
@@ -142,8 +142,8 @@ def test_samples_one_by_one_give_the_same_state_as_the_recording():
 
 def test_before_the_record_and_without_one_only_the_camera_is_known():
     late_ns, nothing_ns = np.array([5000, 5005], np.int64) * S, np.empty(0, np.int64)
-    late = History(late_ns, np.full(2, 24.0), late_ns, np.full(2, 24.0), late_ns, np.full(2, 24.0))
-    empty = History(nothing_ns, np.empty(0), nothing_ns, np.empty(0), nothing_ns, np.empty(0))
+    late = ThermalHistory(late_ns, np.full(2, 24.0), late_ns, np.full(2, 24.0), late_ns, np.full(2, 24.0))
+    empty = ThermalHistory(nothing_ns, np.empty(0), nothing_ns, np.empty(0), nothing_ns, np.empty(0))
     for record in (late, empty):
         found = at(record, 100)
         assert found.camera_degC[0] == 54.0
@@ -156,13 +156,15 @@ def test_a_display_in_quarters_is_refined_between_its_steps():
     true = 24 + 18 * -np.expm1(-times_s / 700) + 2 * -np.expm1(-times_s / 3000)
     stated = 0.25 * np.round(true / 0.25)
     powered_ns = np.array([0], np.int64)
-    record = refined(History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, stated))
+    record = refined(
+        ThermalHistory(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, stated)
+    )
     assert record.resolution_K == 0.25
     error = record.camera_degC - true
     assert np.std(stated - true) > 0.06
     assert np.std(error) < 0.02
     assert np.abs(record.camera_degC - stated).max() <= 0.125 + 1e-9
-    fine = History(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, true)
+    fine = ThermalHistory(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, true)
     np.testing.assert_array_equal(refined(fine).camera_degC, true)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermostand.compensation.history.thermal_history import History
+from thermostand.compensation.history.thermal_history import ThermalHistory
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.compensation.reporting.drawing import report_figures
 from thermostand.compensation.reporting.drawing.figures import as_svg
@@ -39,12 +39,12 @@ def warm_up(session: str, roll_deg: float = 0.0, camera: str = "TS-0001") -> Obs
     )
 
 
-def powered(on_ns: list[int]) -> History:
+def powered(on_ns: list[int]) -> ThermalHistory:
     """Off at 0, on at each instant, off again after 1 s."""
     times = [0] + [time for on in on_ns for time in (on, on + 1_000_000_000)]
     empty = np.zeros(0, np.int64)
     values = np.array([0.0] + [1.0, 0.0] * len(on_ns))
-    return History(empty, empty.astype(float), np.array(times, np.int64), values, empty, empty.astype(float))
+    return ThermalHistory(empty, empty.astype(float), np.array(times, np.int64), values, empty, empty.astype(float))
 
 
 def test_the_drift_is_measured_from_the_reference_or_else_from_the_first_frame():

@@ -20,10 +20,10 @@ from thermostand.compensation.drift.paper_fit import fit_paper
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.observations import Float
 from thermostand.compensation.reporting.pages import validation_page
-from thermostand.compensation.validation3d.deviations import Camera, Deviations, Doubts, deviations, find
+from thermostand.compensation.validation3d.deviations import CalibratedCamera, Deviations, Doubts, deviations, find
 from thermostand.compensation.validation3d.document import as_json, summary
 from thermostand.compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from thermostand.compensation.validation3d.validate import LensModel, Validation, camera_of, check_same, validate
+from thermostand.compensation.validation3d.validate import LensModel, SpatialValidation, camera_of, check_same, validate
 from thermostand.foundation.errors import CalibrationError, SessionError
 
 from .calibration_cases import board, positions, target_of
@@ -50,10 +50,10 @@ def laboratory() -> Laboratory:
 
 
 @pytest.fixture(scope="module")
-def camera(laboratory: Laboratory) -> Camera:
+def camera(laboratory: Laboratory) -> CalibratedCamera:
     """Calibrated from 34 positions at 3 mpx."""
     adjustment = adjust(positions(laboratory), board(laboratory), TABLE)
-    return Camera(adjustment.scene.lens, "pinhole, Brown", adjustment.adjusted_board)
+    return CalibratedCamera(adjustment.scene.lens, "pinhole, Brown", adjustment.adjusted_board)
 
 
 @pytest.fixture(scope="module")
@@ -63,17 +63,17 @@ def model() -> PaperModel:
 
 
 @pytest.fixture(scope="module")
-def validated(laboratory: Laboratory, camera: Camera, model: PaperModel) -> Validation:
+def validated(laboratory: Laboratory, camera: CalibratedCamera, model: PaperModel) -> SpatialValidation:
     observed, frames = validation_session(laboratory, TRUTH, drift, seed=1)
     return validate(observed, frames, camera, model)
 
 
-def undrifted(laboratory: Laboratory, camera: Camera, **options: Any) -> Deviations:
+def undrifted(laboratory: Laboratory, camera: CalibratedCamera, **options: Any) -> Deviations:
     observed, frames = validation_session(laboratory, TRUTH, **options)
     return deviations("as found", camera, observed, frames, observed.centres_px)
 
 
-def test_without_drift_nothing_deviates_by_more_than_the_noise(laboratory: Laboratory, camera: Camera):
+def test_without_drift_nothing_deviates_by_more_than_the_noise(laboratory: Laboratory, camera: CalibratedCamera):
     found = [undrifted(laboratory, camera, seed=seed) for seed in range(4)]
     mean_um = np.mean([one.mean_um for one in found], axis=0)
     assert np.all(mean_um < GOAL_WITHOUT_DRIFT_um)
@@ -83,7 +83,7 @@ def test_without_drift_nothing_deviates_by_more_than_the_noise(laboratory: Labor
     assert np.sqrt(np.mean(turned**2, axis=(0, 1))) == pytest.approx([1, 1, 1], abs=0.25)
 
 
-def test_a_target_that_moved_is_found_along_the_cameras_axes(laboratory: Laboratory, camera: Camera):
+def test_a_target_that_moved_is_found_along_the_cameras_axes(laboratory: Laboratory, camera: CalibratedCamera):
     moved = (Moved(2, 1, shift_mm=(0.005, -0.003, 0.008)), Moved(5, 3, turn_rad=(1e-4, -2e-4, 3e-4)))
     found = undrifted(laboratory, camera, noise_px=1e-5, moved=moved)
     assert found.translation_um[2, 1] == pytest.approx([5, -3, 8], abs=0.05)
@@ -95,13 +95,13 @@ def test_a_target_that_moved_is_found_along_the_cameras_axes(laboratory: Laborat
     assert found.mean_um == pytest.approx(np.array([5, 3, 8]) / 4 / 11, abs=0.03)
 
 
-def test_frames_of_a_position_are_averaged(laboratory: Laboratory, camera: Camera):
+def test_frames_of_a_position_are_averaged(laboratory: Laboratory, camera: CalibratedCamera):
     one, nine = (undrifted(laboratory, camera, frames=count) for count in (1, 9))
     assert nine.noise_um[1:] == pytest.approx(one.noise_um[1:] / 3, rel=0.1)
     assert np.all(nine.mean_um < 0.6 * one.mean_um)
 
 
-def test_the_tables_repeatability_is_measured_by_v0_seen_again(laboratory: Laboratory, camera: Camera):
+def test_the_tables_repeatability_is_measured_by_v0_seen_again(laboratory: Laboratory, camera: CalibratedCamera):
     many = (24.0,) * 18
     moving = undrifted(laboratory, camera, table_mm=(0.001, 0.0, 0.004), temperatures_degC=many)
     assert moving.table_um == pytest.approx([1, 0, 4], rel=0.25, abs=0.3)
@@ -111,7 +111,7 @@ def test_the_tables_repeatability_is_measured_by_v0_seen_again(laboratory: Labor
     assert np.all(still.table_um < (0.1, 0.3, 0.4))
 
 
-def test_compensation_takes_the_drift_out(validated: Validation):
+def test_compensation_takes_the_drift_out(validated: SpatialValidation):
     before, after = validated.before, validated.after
     shift_um = 1e3 * 0.03 * (26 + 0.003 * 26**2) * validated.distance_mm / TRUTH.camera.f_px  # at 50 degC, along J
     scale_um = -1e3 * 0.004 / 1224 * 26 * validated.distance_mm
@@ -126,7 +126,7 @@ def test_compensation_takes_the_drift_out(validated: Validation):
     assert np.all(before.chi[4] > 0.5)
 
 
-def test_the_drift_models_uncertainty_reaches_the_pose(laboratory: Laboratory, camera: Camera):
+def test_the_drift_models_uncertainty_reaches_the_pose(laboratory: Laboratory, camera: CalibratedCamera):
     """Errors drawn as smooth fields of 3 mpx move the pose as much as is claimed."""
     observed, _ = validation_session(laboratory, TRUTH, noise_px=1e-4)
     centres, covariance = observed.centres_px[1], observed.covariance_px2[1]
@@ -147,7 +147,7 @@ def test_the_drift_models_uncertainty_reaches_the_pose(laboratory: Laboratory, c
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_pose_that_was_not_seen_is_left_out_of_the_means_and_shown_as_unknown(
-    laboratory: Laboratory, camera: Camera, model: PaperModel
+    laboratory: Laboratory, camera: CalibratedCamera, model: PaperModel
 ):
     observed, frames = validation_session(laboratory, TRUTH, drift, temperatures_degC=(24.0, 40.0, 12.0))
     few = observed.centres_px.copy()
@@ -166,7 +166,7 @@ def test_a_pose_that_was_not_seen_is_left_out_of_the_means_and_shown_as_unknown(
     assert ["", "V1", *"------"] in cells(validation_page(found))
 
 
-def test_a_reference_without_a_pose_is_refused(laboratory: Laboratory, camera: Camera, model: PaperModel):
+def test_a_reference_without_a_pose_is_refused(laboratory: Laboratory, camera: CalibratedCamera, model: PaperModel):
     observed, frames = validation_session(laboratory, TRUTH, temperatures_degC=(24.0, 40.0))
     few = observed.centres_px.copy()
     few[2, 10:] = np.nan
@@ -175,7 +175,7 @@ def test_a_reference_without_a_pose_is_refused(laboratory: Laboratory, camera: C
 
 
 def test_corrections_beyond_the_models_range_are_flagged(
-    laboratory: Laboratory, camera: Camera, model: PaperModel, validated: Validation
+    laboratory: Laboratory, camera: CalibratedCamera, model: PaperModel, validated: SpatialValidation
 ):
     warm = validate(*validation_session(laboratory, TRUTH, drift, temperatures_degC=(24.0, 60.0)), camera, model)
     assert np.all(warm.flags[1] & Outside.CAMERA)
@@ -185,7 +185,7 @@ def test_corrections_beyond_the_models_range_are_flagged(
     assert not np.any(validated.flags & Outside.CAMERA)
 
 
-def test_table_figures_and_document_show_the_papers_beside_ours(validated: Validation):
+def test_table_figures_and_document_show_the_papers_beside_ours(validated: SpatialValidation):
     text = summary(validated)
     assert "paper, after" in text
     assert text.splitlines()[3].split() == ["paper,", "after", "12.4", "25.4", "28.7"]

@@ -22,7 +22,7 @@ from tests.experiments.sequence_steps import (
     places,
     table_positions,
 )
-from thermostand.experiments.calibration import Calibration, calibration
+from thermostand.experiments.calibration import CalibrationGrid, calibration
 from thermostand.experiments.steps import (
     Capture,
     CheckHome,
@@ -74,7 +74,7 @@ def test_any_calibration_sees_every_position_of_its_grid_that_is_not_left_out(
     whole = {(linear, rotary) for linear in grid["linear_mm"] for rotary in grid["rotary_deg"]}
     left_out = data.draw(st.sets(st.sampled_from(sorted(whole)), max_size=len(whole) - 1))
     omitted = [{"linear_mm": linear, "rotary_deg": rotary} for linear, rotary in left_out]
-    parameters = Calibration.model_validate({**grid, "left_out": omitted})
+    parameters = CalibrationGrid.model_validate({**grid, "left_out": omitted})
     steps = list(calibration(parameters))
     check_order(steps)
     check_ids(steps)
@@ -124,16 +124,20 @@ def test_any_warm_up_asks_for_what_only_hands_can_do_and_for_nothing_else(given_
 @pytest.mark.parametrize(
     ("model", "change", "sentence"),
     [
-        (Calibration, {"left_out": [{"linear_mm": 5, "rotary_deg": 0}]}, r"left_out has \(5.0, 0.0\), which is not"),
-        (Calibration, {"linear_mm": (1, 1)}, "same position twice"),
-        (Calibration, {"linear_mm": (301,)}, "less than or equal to 300"),
-        (Calibration, {"rotary_deg": (361,)}, "less than or equal to 360"),
-        (Calibration, {"rotary_deg": ()}, "at least 1 item"),
-        (Calibration, {"table_position": {"linear": 0}}, "Extra inputs"),
-        (Calibration, {"settle_s": -1}, "greater than or equal to 0"),
-        (Calibration, {"frames_per_position": 0}, "greater than or equal to 1"),
         (
-            Calibration,
+            CalibrationGrid,
+            {"left_out": [{"linear_mm": 5, "rotary_deg": 0}]},
+            r"left_out has \(5.0, 0.0\), which is not",
+        ),
+        (CalibrationGrid, {"linear_mm": (1, 1)}, "same position twice"),
+        (CalibrationGrid, {"linear_mm": (301,)}, "less than or equal to 300"),
+        (CalibrationGrid, {"rotary_deg": (361,)}, "less than or equal to 360"),
+        (CalibrationGrid, {"rotary_deg": ()}, "at least 1 item"),
+        (CalibrationGrid, {"table_position": {"linear": 0}}, "Extra inputs"),
+        (CalibrationGrid, {"settle_s": -1}, "greater than or equal to 0"),
+        (CalibrationGrid, {"frames_per_position": 0}, "greater than or equal to 1"),
+        (
+            CalibrationGrid,
             {"linear_mm": (0,), "rotary_deg": (0,), "left_out": [{"linear_mm": 0, "rotary_deg": 0}]},
             "leaves no position",
         ),
@@ -153,9 +157,9 @@ def test_any_warm_up_asks_for_what_only_hands_can_do_and_for_nothing_else(given_
     ],
 )
 def test_an_impossible_parameter_is_refused_with_a_reason(
-    model: type[Calibration | Validation | WarmUp], change: dict[str, object], sentence: str
+    model: type[CalibrationGrid | Validation | WarmUp], change: dict[str, object], sentence: str
 ):
-    base = {Calibration: GRID, Validation: PLACES, WarmUp: {}}[model]
+    base = {CalibrationGrid: GRID, Validation: PLACES, WarmUp: {}}[model]
     model.model_validate(base)
     with pytest.raises(ValidationError, match=sentence):
         model.model_validate({**base, **change})

@@ -14,7 +14,7 @@ from tests.experiments.sequence_steps import (
     check_order,
     table_positions,
 )
-from thermostand.experiments.calibration import Calibration, calibration
+from thermostand.experiments.calibration import CalibrationGrid, calibration
 from thermostand.experiments.steps import (
     Capture,
     CheckHome,
@@ -184,6 +184,6 @@ def test_each_kind_of_entry_plans_its_own_steps():
     def steps(entry: dict[str, object]) -> Iterator[Step]:
         return (written.step for written in Experiment.model_validate(entry).sequence())
 
-    assert list(steps({"calibration": GRID})) == list(calibration(Calibration.model_validate(GRID)))
+    assert list(steps({"calibration": GRID})) == list(calibration(CalibrationGrid.model_validate(GRID)))
     assert list(steps({"validation": PLACES})) == list(validation(Validation.model_validate(PLACES)))
     assert list(steps({"warm_up": {}})) == list(warm_up(WarmUp()))

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from thermostand.compensation.calibration.adjustment import Adjustment
-from thermostand.compensation.calibration.calibrate import Calibration
+from thermostand.compensation.calibration.calibrate import CameraCalibration
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.uncertainty import grid_pixels
 from thermostand.compensation.reporting.drawing.figures import (
@@ -27,7 +27,7 @@ from thermostand.compensation.reporting.drawing.figures import (
 )
 
 
-def residual_vectors(calibration: Calibration) -> Figure:
+def residual_vectors(calibration: CameraCalibration) -> Figure:
     """Every residual as an arrow from its marker's image; one colour per table position of equal linear position."""
     adjustment = calibration.adjustment
     used, positions = adjustment.used, adjustment.positions
@@ -40,7 +40,7 @@ def residual_vectors(calibration: Calibration) -> Figure:
     return figure
 
 
-def residual_sizes(calibration: Calibration) -> Figure:
+def residual_sizes(calibration: CameraCalibration) -> Figure:
     """RMS residual per coordinate of each position and of each marker, against the detection sigma."""
     adjustment = calibration.adjustment
     squares = np.where(adjustment.used[:, :, None], adjustment.residuals_px**2, np.nan)
@@ -60,7 +60,7 @@ def residual_sizes(calibration: Calibration) -> Figure:
     return figure
 
 
-def normalised_histogram(calibration: Calibration) -> Figure:
+def normalised_histogram(calibration: CameraCalibration) -> Figure:
     """Residuals over their detection sigma, beside the normal distribution they would have if that were all."""
     adjustment = calibration.adjustment
     values = adjustment.normalised[adjustment.used]
@@ -81,7 +81,7 @@ def normalised_histogram(calibration: Calibration) -> Figure:
     return figure
 
 
-def uncertainty_map(calibration: Calibration) -> Figure:
+def uncertainty_map(calibration: CameraCalibration) -> Figure:
     """Standard uncertainty of the projection over the image, and the shift between the halves' calibrations."""
     found = calibration.uncertainty
     with style():
@@ -99,7 +99,7 @@ def uncertainty_map(calibration: Calibration) -> Figure:
     return figure
 
 
-def rays_against_pinhole(calibration: Calibration) -> Figure:
+def rays_against_pinhole(calibration: CameraCalibration) -> Figure:
     """Where the ray model sees what the pinhole sees at a pixel, at the mean distance; blank outside its markers."""
     lens, rays = calibration.adjustment.scene.lens, calibration.rays
     pixels = grid_pixels(lens.image_size, 31)
@@ -113,7 +113,7 @@ def rays_against_pinhole(calibration: Calibration) -> Figure:
     return figure
 
 
-def corrections(calibration: Calibration) -> Figure:
+def corrections(calibration: CameraCalibration) -> Figure:
     """What the adjustment changed: the board in its plane, and the recorded table positions, with uncertainties."""
     adjustment = calibration.adjustment
     with style():
@@ -124,7 +124,7 @@ def corrections(calibration: Calibration) -> Figure:
     return figure
 
 
-def model_scores(calibration: Calibration) -> Figure:
+def model_scores(calibration: CameraCalibration) -> Figure:
     """Hold-out RMS of every model with its standard error; the detection sigma is what no model can beat."""
     scores = calibration.scores
     with style():

@@ -36,7 +36,14 @@ from thermostand.compensation.reporting.drawing.figures import (
     style,
 )
 from thermostand.compensation.reporting.numbers import TablePositions, percent
-from thermostand.compensation.reporting.tracks import Rows, Visit, WarmUp, mean_over_markers, moved_px, thinned
+from thermostand.compensation.reporting.tracks import (
+    CycleVisit,
+    Rows,
+    WarmUpTrack,
+    mean_over_markers,
+    moved_px,
+    thinned,
+)
 from thermostand.experiments.steps import Role
 from thermostand.markers.target import Target
 
@@ -156,7 +163,7 @@ _BETWEEN_SESSIONS_H = 0.5
 MOVED_ON_PURPOSE = tuple(str(role) for role in (Role.CALIBRATION, Role.POSE, Role.REPEATABILITY))
 
 
-def warm_up_curves(observations: Observations, curves: Sequence[WarmUp], titles: Sequence[str]) -> Figure:
+def warm_up_curves(observations: Observations, curves: Sequence[WarmUpTrack], titles: Sequence[str]) -> Figure:
     """Mean drift since the first frame, and the camera's temperature, against the time since it was switched on."""
     with style():
         figure, panels = new_figure(FULL_WIDTH_IN, 4.0, 2, len(curves))
@@ -275,7 +282,9 @@ def _bands(
             shown = None
 
 
-def branches(visits: Sequence[Visit], before: Sequence[BranchDifference], after: Sequence[BranchDifference]) -> Figure:
+def branches(
+    visits: Sequence[CycleVisit], before: Sequence[BranchDifference], after: Sequence[BranchDifference]
+) -> Figure:
     """Mean drift at each set-point on the way up and down, and below it the gap between the two, before and after."""
     has_gaps = len(before) > 0
     with style():
@@ -294,7 +303,7 @@ def branches(visits: Sequence[Visit], before: Sequence[BranchDifference], after:
     return figure
 
 
-def _branch(axes: Axes, visits: Sequence[Visit], index: int, name: str, colour: str) -> None:
+def _branch(axes: Axes, visits: Sequence[CycleVisit], index: int, name: str, colour: str) -> None:
     for one, two in pairwise(visits):
         line = "-" if two.direction > 0 else ":"
         ends = [one.chamber_degC, two.chamber_degC], [one.mean_px[index], two.mean_px[index]]

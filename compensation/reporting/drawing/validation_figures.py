@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from thermostand.compensation.reporting.drawing.figures import I_COLOUR, J_COLOUR, new_figure, style
 from thermostand.compensation.validation3d.deviations import Deviations
 from thermostand.compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from thermostand.compensation.validation3d.validate import Validation
+from thermostand.compensation.validation3d.validate import SpatialValidation
 
 AXES = ("X", "Y", "Z")
 _BEFORE, _AFTER = I_COLOUR, J_COLOUR
@@ -19,7 +19,7 @@ _SPREAD_K = 0.35
 """Between the points of two positions at one temperature, for the eye."""
 
 
-def bars(validation: Validation) -> Figure:
+def bars(validation: SpatialValidation) -> Figure:
     """The form of the paper's figure 15: mean absolute deviation at each temperature, before and after; dashed: the
     paper's means over its temperatures."""
     order = _by_temperature(validation)
@@ -46,7 +46,7 @@ def bars(validation: Validation) -> Figure:
     return figure
 
 
-def by_position(validation: Validation, deviations: Deviations) -> Figure:
+def by_position(validation: SpatialValidation, deviations: Deviations) -> Figure:
     """One variant's deviations at each position, with standard uncertainties."""
     order = _by_temperature(validation)
     degC = validation.camera_degC[order]
@@ -77,6 +77,6 @@ def _legend(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside upper left", ncols=4, handlelength=1.6)
 
 
-def _by_temperature(validation: Validation) -> list[int]:
+def _by_temperature(validation: SpatialValidation) -> list[int]:
     """The temperatures but the reference, the coolest camera first."""
     return [int(index) + 1 for index in np.argsort(validation.camera_degC[1:], kind="stable")]
