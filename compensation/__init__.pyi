@@ -21,7 +21,7 @@ from thermostand.compensation.drift.evaluation import evaluate as evaluate
 from thermostand.compensation.drift.model_file import load_model as load_model
 from thermostand.compensation.drift.model_file import save_model as save_model
 from thermostand.compensation.finding.finder import finder as finder
-from thermostand.compensation.history.states import States as States
+from thermostand.compensation.history.thermal_history import States as States
 from thermostand.compensation.observations import Observations as Observations
 from thermostand.compensation.observations import observe as observe
 from thermostand.compensation.reporting.report import write_report as write_report

@@ -11,8 +11,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermostand.compensation.history.states import States, ThermalMemory
-from thermostand.compensation.history.thermal_history import ThermalHistory, recorded_history, refined, states_at
+from thermostand.compensation.history.thermal_history import (
+    States,
+    ThermalHistory,
+    ThermalMemory,
+    recorded_history,
+    refined,
+    states_at,
+)
 from thermostand.compensation.observations import Float, Observations, SessionFacts
 from thermostand.compensation.one_camera import temperatures_at_frames
 from thermostand.compensation.sound_values import LARGEST_SIDE_px, check_centres, check_degC

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from thermostand.experiments.parameters import Known
+from thermostand.experiments.parameters import CaptureParameters, Known
 from thermostand.experiments.steps import (
     Capture,
     CloseFlap,
@@ -28,15 +28,6 @@ from thermostand.experiments.steps import (
 
 MOST_VISITS = 200
 _VALIDATED_AFTER = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Frames:
-    """Of a visit."""
-
-    count: int
-    interval_s: float
-    exposure_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +50,14 @@ Answer = Visit | Enough | Undecided
 
 
 def first_decision(
-    known: Known, set_points_degC: Sequence[float], held_out_degC: Sequence[float], dwell_s: float, frames: Frames
+    known: Known,
+    set_points_degC: Sequence[float],
+    held_out_degC: Sequence[float],
+    dwell_s: float,
+    frames: int,
+    taken: CaptureParameters,
 ) -> Decide:
-    """The step that begins a cycle of these fixed visits; it is followed by `fixed_visits`."""
+    """The step that begins a cycle of these fixed visits, of so many frames each; it is followed by `fixed_visits`."""
     decide = Decide(
         set_points_degC=tuple(set_points_degC),
         held_out_degC=tuple(held_out_degC),
@@ -76,9 +72,9 @@ def first_decision(
         left_s=0.0,
         visits=0,
         wait_s=known.wait_s,
-        frames=frames.count,
-        interval_s=frames.interval_s,
-        exposure_s=frames.exposure_s,
+        frames=frames,
+        interval_s=taken.interval_s,
+        exposure_s=taken.exposure_s,
     )
     return replace(decide, left_s=usual_s(fixed_visits(decide)))
 

@@ -17,7 +17,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from thermostand.experiments.known import MOST_VISITS, Frames, first_decision, fixed_visits
+from thermostand.experiments.known import MOST_VISITS, first_decision, fixed_visits
 from thermostand.experiments.parameters import (
     Chamber_degC,
     FrameCount,
@@ -93,7 +93,8 @@ def _deciding(parameters: ThermalCycle, known: Known) -> Iterator[Step]:
         parameters.set_points_degC * parameters.cycles,
         parameters.held_out_degC,
         parameters.dwell_s,
-        Frames(parameters.frames_per_point, parameters.interval_s, parameters.exposure_s),
+        parameters.frames_per_point,
+        parameters,
     )
     yield decide
     yield from fixed_visits(decide)

@@ -27,7 +27,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from thermostand.experiments.parameters import Chamber_degC
-from thermostand.experiments.steps import STEPS, SetTemperature, Situation, Soak, Step, kind_of_step
+from thermostand.experiments.steps import STEPS, Capture, SetTemperature, Situation, Soak, Step, kind_of_step
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
 
@@ -210,3 +210,29 @@ def written_steps(entries: Sequence[StepEntry], place: Place, found: Situation) 
                 yield Written(here, step)
                 found = step.situation_after(found)
     return found
+
+
+# Whether a sequence of steps makes sense: what each step needs of those before it.
+
+MOST_STEPS = 100_000  # of a plan: weeks; it is still listed within seconds
+MOST_CAPTURES = 20_000  # more than any camera lives through
+
+
+def checked(steps: Iterable[Written]) -> Iterator[Written]:
+    """The steps as they are; PlanError at the first that cannot be where it is, or is one too many."""
+    for written, fault in faults(steps):
+        if fault:
+            raise PlanError(written.place, fault)
+        yield written
+
+
+def faults(steps: Iterable[Written]) -> Iterator[tuple[Written, str]]:
+    """Each step, and why it cannot be where it is or that it is one too many; "" when it can."""
+    found, captures = Situation(), 0
+    for count, written in enumerate(steps):
+        captures += isinstance(written.step, Capture)
+        fault = written.step.placement_fault(found)
+        if count >= MOST_STEPS or captures > MOST_CAPTURES:
+            fault = f"the plan has more than {MOST_STEPS} steps or {MOST_CAPTURES} captures here; repeat less often"
+        found = written.step.situation_after(found)
+        yield written, fault

@@ -22,27 +22,281 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.markers.band import NARROW_SIGMA, WIDE_EXCESS, WIDE_SIGMA, Strangeness, excess_px2, strangeness
 from thermostand.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
 from thermostand.markers.edge_fit import EdgeFit, Flag, fit_edges
-from thermostand.markers.edge_model import B0, F0, SIGMA, EdgeState
-from thermostand.markers.expected import expected_edges, implied_edges
-from thermostand.markers.following import has_followed, rows_round, still_there
+from thermostand.markers.edge_model import B0, CX, CY, F0, M11, M12, M22, PARAMETERS, SIGMA, EdgeState, Float
 from thermostand.markers.grid import (
     DetectionError,
     Identified,
-    expected_px,
     fit_homography,
     identify,
     pitch_px,
-    project,
 )
-from thermostand.markers.light import under_common_light
+from thermostand.markers.newton import LEAST_BAND_PX
 from thermostand.markers.noise import Image, Noise
 from thermostand.markers.pixels import Mask, Picture, picture_of
+from thermostand.markers.plane import expected_px, project
 from thermostand.markers.refit import refit_edges
-from thermostand.markers.sandwich import SAMPLED_MARKERS
+from thermostand.markers.sandwich import SAMPLED_MARKERS, variance_growth, variance_ratio
 from thermostand.markers.target import Target
+
+# How wide a band of pixels round the outlines is fitted, and what its width says about the centres' errors.
+#
+# Where the model holds, the levels of ground and disc are known best from a wide band: 1.01 of the Cramer-Rao limit,
+# and 1.09..1.16 from a narrow one. A real ground is no plane: grain, texture and shadows move the centre, the further
+# out they are looked at the more. Fits in both bands tell (Hausman): with independent noise their centres differ by no
+# more than their variances do,
+#
+#     mean (c_wide - c_narrow)^2 = var_narrow - var_wide
+#
+# and what is beyond that is misfit. It grows about in proportion to the width, so it is as large as what is left in the
+# centres of a band of half the width, and a quarter of the squared misfit of the wide one.
+
+WIDE_SIGMA, NARROW_SIGMA = 9.0, 4.5
+"""Half widths of the band in blurs."""
+WIDE_EXCESS = (WIDE_SIGMA / NARROW_SIGMA) ** 2
+_DOUBTFUL_GROWTH, _SUSPECT_GROWTH = 1.4, 1.3
+"""Along x or y alone, as rows that flicker have it."""
+_DOUBTFUL_TOGETHER, _SUSPECT_TOGETHER = 0.35, 0.3
+"""Growth along x and y and of the levels' variance: each scatters by itself where there is only noise, and they grow
+together where residuals hang together: 0.05 +- 0.09 by noise alone (54 markers), 0.59 +- 0.12 by JPEG of quality 90."""
+_DOUBTFUL_CHANCES = 3.0
+_DOUBTFUL_LEVELS = 1.3
+_BEYOND_CHANCE = 1.5
+"""Of a mean square over a frame's markers, 54 of them: chance reaches it once in a hundred frames."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Strangeness:
+    """How much the residuals of a frame hang together, each 0 (levels: 1) where there is noise alone. along: growth of
+    variance along x or y, the larger. together: that of x and y, their mean, and of the levels. chance: standard
+    deviation of `together`'s first part. levels: root mean square of the sectors' levels. growth: (2,), of the
+    variances along x and y (sandwich.py)."""
+
+    growth: Float
+    along: float
+    together: float
+    chance: float
+    levels: float
+
+    def is_doubtful(self) -> bool:
+        """Whether what is seen is not what the noise model describes. Of 100 frames of noise alone at most one."""
+        limit = max(_DOUBTFUL_TOGETHER, _DOUBTFUL_CHANCES * self.chance)
+        return self.along > _DOUBTFUL_GROWTH - 1 or self.together > limit or self.levels > _DOUBTFUL_LEVELS
+
+    def is_suspect(self) -> bool:
+        """Whether it may be doubtful, if this is from a sample of the markers: then it takes all to decide."""
+        return self.along > _SUSPECT_GROWTH - 1 or self.together > _SUSPECT_TOGETHER or self.levels > _DOUBTFUL_LEVELS
+
+
+def strangeness(fit: EdgeFit, clean: NDArray[np.bool_]) -> Strangeness:
+    """Of the `clean` (N,) markers."""
+    if not clean.any():
+        return Strangeness(np.ones(2), 0.0, 0.0, 0.0, 1.0)
+    levels = float(np.median(fit.levels[clean] / fit.chi[clean]))
+    ratio, chance = variance_ratio(fit.scatter, clean)
+    growth = variance_growth(ratio, chance)
+    together = float(ratio.mean()) - 1 + levels**2 - 1
+    return Strangeness(growth, float(growth.max()) - 1, together, float(np.linalg.norm(chance)) / 2, levels)
+
+
+def excess_px2(wide: EdgeFit, narrow: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> Float:
+    """By what the mean squared difference of the centres (x, y) exceeds that of independent noise, px^2, 0 where it may
+    be chance. growth: of the wide fit. clean: (N,), markers without a flag in both."""
+    if not clean.any():
+        return np.zeros(2)
+    difference = np.mean((wide.state.centres_px() - narrow.state.centres_px())[clean] ** 2, axis=0)
+    same_noise = ((wide.chi / narrow.chi) ** 2)[clean, None]
+    variances = [np.diagonal(fit.covariance_px2, axis1=1, axis2=2)[clean] for fit in (wide, narrow)]
+    expected = np.maximum(np.mean(same_noise * variances[1] - variances[0], axis=0), 0) * growth
+    return np.where(difference > _BEYOND_CHANCE * expected, difference - expected, 0.0)
+
+
+# The ellipses that a target's markers should be in the image, by the target's plane and by the other markers.
+
+_FIRST_BLUR_PX = 1.2
+_LEAST_PEERS = 8
+"""Markers that a shape is predicted from, with three coefficients each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Implied:
+    """state: the edges of K markers. spread: (K, 4), standard deviations of their m11, m12, m22 and sigma."""
+
+    state: EdgeState
+    spread: Float
+
+
+def expected_edges(homography: Float, target: Target) -> EdgeState:
+    """The image ellipses of the target's circles, levels unknown (NaN): conic C = H^-T Q H^-1 of each circle Q."""
+    x, y = target.coordinates_mm().T
+    radius = target.diameters_mm() / 2
+    _require_in_front(homography, np.column_stack([x, y]), radius)
+    circle = np.zeros((target.count, 3, 3))
+    circle[:, [0, 1, 2], [0, 1, 2]] = np.stack([np.ones_like(x), np.ones_like(x), x**2 + y**2 - radius**2], axis=1)
+    circle[:, 0, 2] = circle[:, 2, 0] = -x
+    circle[:, 1, 2] = circle[:, 2, 1] = -y
+    back = np.linalg.inv(homography)
+    conic = back.T @ circle @ back
+    centre = -np.linalg.solve(conic[:, :2, :2], conic[:, :2, 2, None])[:, :, 0]
+    level = conic[:, 2, 2] + np.einsum("ni,ni->n", conic[:, :2, 2], centre)
+    shape = -conic[:, :2, :2] / level[:, None, None]
+    scale = np.linalg.det(shape) ** -0.25
+    shape = shape * (scale**2)[:, None, None]
+    parameters = np.full((target.count, 12), np.nan)
+    parameters[:, [CX, CY]] = centre
+    parameters[:, M11], parameters[:, M12], parameters[:, M22] = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
+    parameters[:, SIGMA] = _FIRST_BLUR_PX
+    return EdgeState(parameters, scale)
+
+
+def _require_in_front(homography: Float, centres_mm: Float, radii_mm: Float) -> None:
+    """DetectionError when the image's horizon goes between or through the discs: their outlines are no ellipses."""
+    corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    project(homography, (centres_mm[:, None] + radii_mm[:, None, None] * corners).reshape(-1, 2))
+
+
+def implied_edges(
+    state: EdgeState, homography: Float, target: Target, clean: NDArray[np.bool_], which: NDArray[np.intp]
+) -> Implied | None:
+    """What the `clean` (N,) markers of `state` say about those numbered `which` (K,), from 0.
+
+    Shapes deviate from the homography's ellipses, and blurs from each other, linearly over the target; only markers of
+    the same size are asked, as a print grows all its outlines by the same width. Levels are those of the nearest clean
+    marker. None when there is nobody to ask.
+    """
+    diameters = target.diameters_mm()
+    peers = [clean & (diameters == diameters[n]) for n in which]
+    if not peers or min(np.count_nonzero(group) for group in peers) < _LEAST_PEERS:
+        return None
+    places = target.coordinates_mm()
+    expected = expected_edges(homography, target)
+    known = np.where(clean[:, None], state.centres_px(), np.nan)
+    expected.parameters[:, [CX, CY]] = expected_px(places, known, homography)
+    in_scale = state.parameters[:, M11 : SIGMA + 1].copy()
+    in_scale[:, :3] *= ((expected.scale_px / state.scale_px) ** 2)[:, None]
+    deviation = in_scale - np.pad(expected.parameters[:, M11:SIGMA], ((0, 0), (0, 1)))
+    design = np.column_stack([np.ones(target.count), places])
+    implied, spread = expected[which], np.empty((len(which), 4))
+    for row, (n, group) in enumerate(zip(which, peers, strict=True)):
+        by_peers = design[n] @ np.linalg.pinv(design[group])
+        scatter = deviation[group] - design[group] @ np.linalg.pinv(design[group]) @ deviation[group]
+        variance = np.sum(scatter**2, axis=0) / (np.count_nonzero(group) - design.shape[1])
+        spread[row] = np.sqrt(variance * (1 + by_peers @ by_peers))
+        implied.parameters[row, SIGMA] = 0
+        implied.parameters[row, M11 : SIGMA + 1] += by_peers @ deviation[group]
+        nearest = np.flatnonzero(clean)[np.linalg.norm(places[clean] - places[n], axis=1).argmin()]
+        implied.parameters[row, B0:] = state.parameters[nearest, B0:]
+    return Implied(implied, spread)
+
+
+# Whether a target is still where the frame before had it, and which rows of the picture it takes to follow it.
+
+_FOLLOWED_PART = 0.9
+_GREATEST_STEP_PX = 5.0
+_GLANCE_BLURS = 3.0
+_GLANCE_CONTRAST = 0.75
+_TOWARDS = np.array([[function(k * np.pi / 8) for k in range(16)] for function in (np.cos, np.sin)])
+_TWICE = 2 * _TOWARDS[0] * _TOWARDS[1]
+_ROOM_PX, _ROOM_OF_UNSEEN = 4.0, 0.5
+"""By what a marker may move, or its band grow, until rows are looked at that were not foreseen; of one that was not
+seen, in radii: the search for it begins in its place and goes further."""
+
+
+def still_there(picture: Picture, state: EdgeState, is_seen: Mask, inwards: Float) -> bool:
+    """Whether the markers (N,) that were seen still look as they did: a glance at 16 pixels on either side of each
+    outline, not nearer to the centre than `inwards` (N, 1) radii. Much cheaper than a fit that ends nowhere because the
+    target has moved."""
+    m11, m12, m22 = (state.parameters[:, [each]] for each in (M11, M12, M22))
+    radius = state.scale_px[:, None] / np.sqrt(m11 * _TOWARDS[0] ** 2 + m22 * _TOWARDS[1] ** 2 + m12 * _TWICE)
+    margin = np.minimum(_GLANCE_BLURS * state.parameters[:, [SIGMA]], np.minimum(0.6, 1 - inwards) * radius)
+    along = np.stack([radius + margin, radius - margin])
+    column, row = (
+        np.clip(np.rint(state.parameters[:, [axis]] + along * _TOWARDS[axis]), 0, picture.shape[1 - axis] - 1)
+        for axis in (CX, CY)
+    )
+    levels = picture.values_DN(row.astype(np.intp), column.astype(np.intp)).mean(axis=2)
+    unchanged = (levels[0] - levels[1]) / state.contrast_DN() > _GLANCE_CONTRAST
+    return bool(unchanged[is_seen].mean() >= _FOLLOWED_PART)
+
+
+def has_followed(now_px: Float, before_px: Float) -> bool:
+    """Whether centres (N, 2), NaN for missing ones, are of the same markers as before: about as many, and none far from
+    where it was."""
+    found, found_before = (int(np.isfinite(centres[:, 0]).sum()) for centres in (now_px, before_px))
+    moved = np.linalg.norm(now_px - before_px, axis=1)
+    return bool(found >= _FOLLOWED_PART * found_before and np.nanmax(moved) < _GREATEST_STEP_PX)
+
+
+def rows_round(state: EdgeState, is_seen: Mask, outwards: Float, band_sigma: float, height: int) -> Mask:
+    """The rows (height,) that a fit from `state` looks at, in all likelihood: those of each marker's band, which ends
+    `outwards` (N,) radii from the centre, and some more."""
+    half_px, blur_px, mean_px = state.half_extents_px(), state.parameters[:, SIGMA], state.radii_px()
+    squares = np.sum(half_px**2, axis=1)
+    long_px = np.sqrt(0.5 * (squares + np.sqrt(np.maximum(squares**2 - 4 * mean_px**4, 0))))
+    width = np.maximum(band_sigma * blur_px, LEAST_BAND_PX) * long_px / mean_px**2
+    band_px = half_px[:, 1] * np.minimum(1 + width, outwards)
+    reach_px = np.maximum(band_px, half_px[:, 1] + _GLANCE_BLURS * blur_px)
+    reach_px += np.where(is_seen, _ROOM_PX, np.maximum(_ROOM_OF_UNSEEN * half_px[:, 1], _ROOM_PX))
+    middle = state.centres_px()[:, 1]
+    begins = np.clip(np.floor(middle - reach_px), 0, height).astype(int)
+    ends = np.clip(np.ceil(middle + reach_px) + 1, 0, height).astype(int)
+    edges = np.bincount(begins, minlength=height + 1) - np.bincount(ends, minlength=height + 1)
+    return np.cumsum(edges[:height]) > 0
+
+
+# The light that the discs and the ground between them have in common.
+#
+# Twelve parameters let the light slope otherwise on a disc than on the ground round it. Where it does, because light is
+# scattered onto the image, fewer parameters put the centres wrong by twice the noise; where it does not, they cost 5 %
+# of the accuracy, 7 % when blurred. All markers of a frame together show how much the two slopes differ, beyond what
+# noise explains; each marker's slopes are then pulled together as far as that allows, and the centre goes with them:
+#
+#     r = low / high * slope(high) - slope(low)          DN per px, expected 0 +- w; w^2 = mean(r^2 - variance of r)
+#     centre -= cov(centre, r) (cov(r) + w^2)^-1 r
+#
+# high and low are the levels of the lighter and of the darker side.
+
+_LEAST_MARKERS = 20
+"""So many determine w^2 to a quarter of the variance of r."""
+_BELIEVED_CHI2, _DOUBTED_CHI2 = 2.0, 5.0
+"""A marker whose slopes differ by more (chi^2 of two) is pulled less and less, and then stays as it is: faint glare
+that no flag shows would gain weight."""
+
+
+def under_common_light(fit: EdgeFit, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """Centres (N, 2) px and their covariances (N, 2, 2), where the slopes of the `clean` (N,) markers are believed to
+    differ no more than the frame shows; the others, and all where they are few, as they were fitted."""
+    centres, covariance = fit.state.centres_px().copy(), fit.covariance_px2.copy()
+    if np.count_nonzero(clean) < _LEAST_MARKERS:
+        return centres, covariance
+    state, whole = fit.state[np.flatnonzero(clean)], fit.covariance[clean]
+    by_parameters = _by_parameters(state)
+    differing = np.einsum("nij,nj->ni", by_parameters, state.parameters)
+    shared = whole[:, :2] @ by_parameters.transpose(0, 2, 1)
+    variance = by_parameters @ whole @ by_parameters.transpose(0, 2, 1)
+    beyond = np.mean(differing**2 - np.diagonal(variance, axis1=1, axis2=2))
+    inverse = np.linalg.inv(variance + max(float(beyond), 0.0) * np.eye(2))
+    gain = shared @ inverse
+    chi2 = np.einsum("ni,nij,nj->n", differing, inverse, differing)
+    part = np.clip((_DOUBTED_CHI2 - chi2) / (_DOUBTED_CHI2 - _BELIEVED_CHI2), 0, 1)[:, None]
+    centres[clean] -= part * np.einsum("nij,nj->ni", gain, differing)
+    covariance[clean] -= (part * (2 - part))[:, :, None] * (gain @ shared.transpose(0, 2, 1))
+    return centres, covariance
+
+
+def _by_parameters(state: EdgeState) -> Float:
+    """The derivatives of r by the parameters (N, 2, 12), but for those by the levels, which are known far better."""
+    rows = np.arange(len(state.scale_px))
+    ground, disc = state.parameters[:, B0], state.parameters[:, F0]
+    high, low = np.where(ground > disc, B0, F0), np.where(ground > disc, F0, B0)
+    share = np.maximum(np.minimum(ground, disc), 0) / np.maximum(ground, disc)
+    derivatives = np.zeros((len(rows), 2, PARAMETERS))
+    for axis in range(2):
+        derivatives[rows, axis, high + 1 + axis] = share / state.scale_px
+        derivatives[rows, axis, low + 1 + axis] = -1 / state.scale_px
+    return derivatives
+
 
 __all__ = [
     "Detection",
@@ -56,8 +310,6 @@ __all__ = [
     "nothing_found",
     "rows_to_follow",
 ]
-
-Float = NDArray[np.float64]
 
 _POOR_CHI = 1.25
 _POOR_MISFIT = 1.6
@@ -78,7 +330,7 @@ class Detection:
     homography: (3, 3), target mm -> px. state: the fitted edges, the start of the next frame. growth: (2,), by what the
     variances along x and y exceed, or fall below, those of residuals that are independent of each other (sandwich.py).
     excess_px2: (2,), what misfit of ground and disc adds to them, px^2. band_sigma: half width of the band of pixels
-    fitted, in blurs (band.py). The next frame keeps these two. is_doubtful: the noise model does not describe the
+    fitted, in blurs (below). The next frame keeps these two. is_doubtful: the noise model does not describe the
     picture (compression, texture, print, flicker): the covariance is an estimate from how its residuals hang together.
     is_orientation_assumed: nothing says which way up the target is (Target.orientation): half a turn looks the same.
     """
@@ -342,7 +594,13 @@ def _refitted(detection: Detection, fit: EdgeFit, picture: Picture, target: Targ
     scaled = Noise(noise.floor_DN2 * usual**2, noise.slope_DN * usual**2)
     patience = float(np.median(fit.misfit[clean])) / usual
     again = refit_edges(
-        picture, implied.state, implied.spread, scaled, _reach(target)[poor], patience, detection.band_sigma
+        picture,
+        implied.state,
+        implied.spread,
+        scaled,
+        _reach(target)[poor],
+        patience=patience,
+        band_sigma=detection.band_sigma,
     )
     credible = (again.chi < _POOR_CHI) & _has_contrast(again.state, target, scaled)
     which = poor[credible]

@@ -4,25 +4,294 @@
 2. Placement: every way the target's cells can lie on the lattice; gaps that the growth left are filled. The smallest
    homography residual wins, not the largest count: clutter in line with the grid adds support, but does not fit. Where
    a side of the grid is beyond the frame, the window wins whose missing markers are all beyond it.
-3. Orientation: the marks (marks.py), else the rotation nearest to the previous frame's, else to the nominal roll (0:
+3. Orientation: the marks, else the rotation nearest to the previous frame's, else to the nominal roll (0:
    the rows point to the right, marker 1 is bottom left). Never a guess: what stays open is refused.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from thermostand.foundation.errors import DetectionError
 from thermostand.markers.bootstrap import Candidates
-from thermostand.markers.lattice import largest_lattice
-from thermostand.markers.marks import with_marks
-from thermostand.markers.placement import LEAST_SEEN, GridPlacement, placements, settled
-from thermostand.markers.plane import area_scale, expected_px, fit_homography, pitch_px, project, roll_deg
-from thermostand.markers.target import Target
+from thermostand.markers.lattice import Cell, largest_lattice
+from thermostand.markers.plane import (
+    area_scale,
+    checked_homography,
+    expected_px,
+    fit_homography,
+    pitch_px,
+    project,
+    roll_deg,
+)
+from thermostand.markers.target import DonutMarkers, OddMarker, Target
+
+# The ways a target lies over a lattice grown through the candidates.
+
+_MISSING_PX = 0.5
+_FEWER_THAN_BEST = 2
+LEAST_SEEN = 6
+"""Fewer markers are no placement: any four fit a homography."""
+_OWN_PLACE = (0.2, 0.06)
+"""A marker is this close to where the others put it, in distances of neighbours: while some of them may be wrong, and
+when those have gone."""
+_BEYOND_CELLS = 2
+_REACH = 0.35
+_WORTH_SETTLING = 0.7
+_RANSAC_PITCH = 0.12
+_QUARTER_TURN = np.array([[0, 1], [-1, 0]])
+_SHEARS = tuple(np.array(shear) for shear in ([[1, 1], [0, 1]], [[1, -1], [0, 1]], [[1, 0], [1, 1]], [[1, 0], [-1, 1]]))
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridPlacement:
+    """One way to lay the target over the lattice. candidate: (N,) of each marker, -1 for none. homography: target mm
+    -> px. residual_px: root mean square over the markers seen, and half a pixel for each that is missing.
+    """
+
+    candidate: Index
+    homography: Float
+    residual_px: float
+
+    @property
+    def seen(self) -> int:
+        """How many markers have a candidate."""
+        return int((self.candidate >= 0).sum())
+
+
+def placements(lattice: dict[Cell, int], points: Float, target: Target) -> list[GridPlacement]:
+    """All placements with at most two markers fewer than the best, in all rotations; gaps and misfits settled."""
+    cells: Index = np.array(list(lattice.keys()), dtype=np.intp)
+    members: Index = np.array(list(lattice.values()), dtype=np.intp)
+    if not _counter_clockwise(cells, points[members]):
+        cells = cells * np.array([1, -1])
+    tables = _turned(cells, members, target)
+    if max(_seen(table) for table in tables) < target.least_markers:
+        # In a lattice seen at a slant a diagonal may be the shorter step.
+        tables += [table for shear in _SHEARS for table in _turned(cells @ shear, members, target)]
+    if max(_seen(table) for table in tables) < target.count:
+        tables = _settled(tables, points, target)
+        tables += _settled(_beyond(tables, points, target), points, target)
+    return _placed(_fullest(_distinct(tables)), points, target)
+
+
+def _placed(tables: list[Index], points: Float, target: Target) -> list[GridPlacement]:
+    """The placements of those tables that are the image of a flat target at all."""
+    possible: list[GridPlacement] = []
+    for table in tables:
+        with suppress(DetectionError):
+            possible.append(placement(table, points, target))
+    return possible
+
+
+def _settled(tables: list[Index], points: Float, target: Target) -> list[Index]:
+    most = max((_seen(table) for table in tables), default=0)
+    near = [table for table in tables if _seen(table) >= max(LEAST_SEEN, _WORTH_SETTLING * most)]
+    tree, possible = KDTree(points), list[Index]()
+    for table in near:
+        with suppress(DetectionError):
+            possible.append(settled(table, points, tree, target))
+    return possible
+
+
+def _beyond(tables: list[Index], points: Float, target: Target) -> list[Index]:
+    """The best table moved by up to two cells, where that finds as many markers: the growth may have missed a side of
+    the grid and continued into clutter at the other.
+    """
+    possible = _placed(_fullest(tables), points, target)
+    if not possible:
+        return []
+    best = min(possible, key=lambda p: p.residual_px)
+    cells, members = target.cells()[best.candidate >= 0], best.candidate[best.candidate >= 0]
+    least = max(LEAST_SEEN, _WORTH_SETTLING * best.seen)
+    moved = [table for table in _turned(cells, members, target, _BEYOND_CELLS) if _seen(table) >= least]
+    tree = KDTree(points)
+    return [table for table in moved if _within_reach(table, points, tree, target) >= best.seen - _FEWER_THAN_BEST]
+
+
+def _within_reach(candidate: Index, points: Float, tree: KDTree, target: Target) -> int:
+    """How many markers have a candidate near where the homography of those in the table puts them."""
+    target_mm = target.coordinates_mm()
+    seen = candidate >= 0
+    try:
+        homography = fit_homography(target_mm[seen], points[candidate[seen]])
+        away, _ = tree.query(project(homography, target_mm))
+    except DetectionError:
+        return 0
+    return int((away < _REACH * pitch_px(homography, target)).sum())
+
+
+def _fullest(tables: list[Index]) -> list[Index]:
+    most = max((_seen(table) for table in tables), default=0)
+    return [table for table in tables if _seen(table) >= max(LEAST_SEEN, most - _FEWER_THAN_BEST)]
+
+
+def placement(candidate: Index, points: Float, target: Target) -> GridPlacement:
+    """The homography of a table marker -> candidate, and how well it fits."""
+    seen = candidate >= 0
+    target_mm, centres_px = target.coordinates_mm()[seen], points[candidate[seen]]
+    homography = fit_homography(target_mm, centres_px)
+    off = np.linalg.norm(project(homography, target_mm) - centres_px, axis=1)
+    missing = len(candidate) - int(seen.sum())
+    return GridPlacement(candidate, homography, float(np.sqrt(np.mean(off**2))) + _MISSING_PX * missing)
+
+
+def settled(candidate: Index, points: Float, tree: KDTree, target: Target) -> Index:
+    """Each marker's candidate chosen again: the one nearest to where all others put it, -1 when none is near enough.
+    tree: of the points.
+
+    Clutter in line with the grid goes, and a marker that the growth did not reach comes.
+    """
+    target_mm = target.coordinates_mm()
+    for own_place in _OWN_PLACE:
+        seen = candidate >= 0
+        if seen.sum() < LEAST_SEEN:
+            return candidate
+        homography = _robust_homography(target_mm[seen], points[candidate[seen]], target)
+        centres_px = np.where(seen[:, None], points[candidate], np.nan)
+        place = expected_px(target_mm, centres_px, homography)
+        limit = own_place * target.spacing_mm * np.sqrt(area_scale(homography, target_mm))
+        away, found = tree.query(place)
+        candidate = np.where(away < limit, np.asarray(found, dtype=np.intp), np.intp(-1))
+    return candidate
+
+
+def _robust_homography(target_mm: Float, centres_px: Float, target: Target) -> Float:
+    threshold_px = _RANSAC_PITCH * pitch_px(fit_homography(target_mm, centres_px), target)
+    return checked_homography(cv2.findHomography(target_mm, centres_px, cv2.RANSAC, threshold_px)[0])
+
+
+def _distinct(tables: list[Index]) -> list[Index]:
+    return list(np.unique(np.stack(tables), axis=0)) if tables else []
+
+
+def _seen(candidate: Index) -> int:
+    return int((candidate >= 0).sum())
+
+
+def _counter_clockwise(cells: Index, points: Float) -> bool:
+    """Whether the lattice, as numbered, is seen from the front: the second axis is a quarter turn counter-clockwise
+    of the first, which is a negative cross product while y points down.
+    """
+    design = np.column_stack([cells, np.ones(len(cells))])
+    first, second = np.linalg.lstsq(design, points, rcond=None)[0][:2]
+    return bool(first[0] * second[1] - first[1] * second[0] < 0)
+
+
+def _turned(cells: Index, members: Index, target: Target, beyond: int = 0) -> list[Index]:
+    tables: list[Index] = []
+    for _ in range(4):
+        tables += _windows(cells, members, target, beyond)
+        cells = cells @ _QUARTER_TURN
+    return tables
+
+
+def _windows(cells: Index, members: Index, target: Target, beyond: int) -> list[Index]:
+    """Every place of the target in the lattice's bounds and `beyond` cells around, as tables marker -> candidate."""
+    own = target.cells()
+    own = own - own.min(axis=0)
+    low = cells.min(axis=0)
+    extent, size = cells.max(axis=0) - low + 1, own.max(axis=0) + 1
+    margin = np.maximum(size - extent, 0) + beyond
+    places = np.abs(extent - size) + 2 * beyond + 1
+    occupied = np.full(places + size, -1, dtype=np.intp)
+    occupied[tuple((cells - low + margin).T)] = members
+    return [occupied[own[:, 0] + left, own[:, 1] + bottom] for left in range(places[0]) for bottom in range(places[1])]
+
+
+# What is printed on a target to show which way up it is: the odd marker, or the three with a hole.
+
+_MOST_WRONG = 1
+"""Of the markers of a placement, those with a hole that should have none or without one that should: glare in a disc
+looks like a hole, dirt fills one. Another turn of the target has at least as many wrong as it puts marks elsewhere."""
+
+
+def with_marks(placements: list[GridPlacement], candidates: Candidates, target: Target) -> list[GridPlacement]:
+    """Those placements that the marks agree with, all when the target has none. Raises DetectionError when there are
+    none, and says when a mirror image would agree."""
+    if target.odd_marker is not None:
+        return _with_odd_marker(placements, candidates, target, target.odd_marker)
+    if target.donut_markers is not None:
+        return _with_donuts(placements, candidates, target, target.donut_markers)
+    return placements
+
+
+def _with_odd_marker(
+    placements: list[GridPlacement], candidates: Candidates, target: Target, odd: OddMarker
+) -> list[GridPlacement]:
+    """Those with a disc of the odd size in the odd marker's place."""
+    tolerance = 0.5 * abs(np.log(odd.diameter_mm / target.diameter_mm))
+
+    def agrees(placement: GridPlacement) -> bool:
+        return bool(abs(np.log(_odd_size(placement, candidates, target, odd))) < tolerance)
+
+    fitting = [p for p in placements if agrees(p)]
+    if fitting:
+        return fitting
+    mirrored = any(agrees(one) for p in placements for one in _mirrored(p, target))
+    raise _refusal(placements, target, f"odd marker {odd.number}", mirrored=mirrored)
+
+
+def _with_donuts(
+    placements: list[GridPlacement], candidates: Candidates, target: Target, donuts: DonutMarkers
+) -> list[GridPlacement]:
+    """Those whose holes are where they should be, with the fewest wrong ones."""
+    wrong = [_wrong_holes(p, candidates, target) for p in placements]
+    if min(wrong) <= _MOST_WRONG:
+        return [p for p, number in zip(placements, wrong, strict=True) if number == min(wrong)]
+    mirrored = min(
+        (_wrong_holes(one, candidates, target) for p in placements for one in _mirrored(p, target)), default=min(wrong)
+    )
+    name = "donut markers {}, {} and {}".format(*donuts.numbers)
+    raise _refusal(placements, target, name, mirrored=mirrored <= _MOST_WRONG)
+
+
+def _refusal(placements: list[GridPlacement], target: Target, marks: str, *, mirrored: bool) -> DetectionError:
+    found = max(p.seen for p in placements)
+    if mirrored:
+        return DetectionError(
+            f"the image of {target.name} is mirrored, by the place of its {marks}: turn mirroring off in the camera or "
+            "the viewer",
+            found,
+        )
+    return DetectionError(f"found {found} of {target.count} markers of {target.name}, but not the {marks}", found)
+
+
+def _mirrored(placement: GridPlacement, target: Target) -> list[GridPlacement]:
+    """The placements of a mirrored target."""
+    return [
+        replace(placement, candidate=placement.candidate[places])
+        for places, is_mirror in target.symmetries()
+        if is_mirror
+    ]
+
+
+def _odd_size(placement: GridPlacement, candidates: Candidates, target: Target, odd: OddMarker) -> float:
+    """Diameter of the disc in the odd marker's place over the expected one; the other markers give the scale."""
+    seen, index = placement.candidate >= 0, odd.number - 1
+    if not seen[index]:
+        return float("inf")
+    expected = target.diameters_mm() * np.sqrt(area_scale(placement.homography, target.coordinates_mm()))
+    size = np.sqrt(candidates.areas_px2[placement.candidate]) / expected
+    return float(size[index] / np.median(size[seen]))
+
+
+def _wrong_holes(placement: GridPlacement, candidates: Candidates, target: Target) -> int:
+    """How many markers have a hole that should have none, or none that should have one; marks that are not seen count
+    as well."""
+    seen, donut = placement.candidate >= 0, target.is_donut()
+    hollow: NDArray[np.bool_] = candidates.hollow[placement.candidate] > 0.5 * target.hole_part
+    return int(np.count_nonzero((hollow != donut)[seen])) + int(np.count_nonzero(donut & ~seen))
+
 
 __all__ = [
     "DetectionError",
@@ -42,9 +311,6 @@ _MOST_SPOTS, _MOST_SPOTS_PER_MARKER = 2000, 20
 """Among more spots that look like markers nothing is looked for: the time grows with their number."""
 _LARGEST_LATTICE = 4
 """In a lattice of more than so many times its markers the target fits in hundreds of places."""
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

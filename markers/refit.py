@@ -43,7 +43,7 @@ class Refit:
 
 
 def refit_edges(
-    image: Picture, start: EdgeState, spread: Float, noise: Noise, reach: Float, patience: float, band_sigma: float
+    image: Picture, start: EdgeState, spread: Float, noise: Noise, reach: Float, *, patience: float, band_sigma: float
 ) -> Refit:
     """Fit markers from the ellipses `start` that the others imply. spread: (N, 4), standard deviations of their m11,
     m12, m22 and sigma. noise: such that clean markers have chi 1. patience: how much more than noise clean markers'

@@ -49,7 +49,7 @@ _LEAST_ARC_px = 3.0
 
 SAMPLED_MARKERS = 27
 """Of a frame, evenly spread: they determine the growth of its variances to 16 %, at half of the time of all, which are
-looked at where the sample is conspicuous (band.py)."""
+looked at where the sample is conspicuous (detection.py)."""
 _LEAST_MARKERS = 8
 """With fewer the growth of a frame's variances is a guess."""
 _DOUBT_OF_LESS = 2.0

@@ -291,16 +291,16 @@ Effect = Callable[[StandState, Geometry], tuple[float, float]]
 class BudgetLine:
     """One line. um, px: at its largest over the session's captures, with sign. u_um, u_px: their standard
     uncertainties; NaN for a scatter, which is one itself. where: the place in the image. corrected: whether
-    correction.py takes it out, so that only the uncertainty stays.
+    a validation takes it out, so that only the uncertainty stays.
     """
 
     name: str
     um: float
-    u_um: float
     px: float
-    u_px: float
     where: str
-    corrected: bool
+    u_um: float = math.nan
+    u_px: float = math.nan
+    corrected: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,14 +415,15 @@ def _largest(
     nominal = np.array(effect(state, geometry))
     off = [np.array(effect(*inputs)) - nominal for inputs in varied(state, geometry)]
     u_um, u_px = np.sqrt(np.sum(np.square(off), axis=0))
-    return BudgetLine(name, float(nominal[0]), float(u_um), float(nominal[1]), float(u_px), where, corrected)
+    um, px = nominal.tolist()
+    return BudgetLine(name, um, px, where, u_um=float(u_um), u_px=float(u_px), corrected=corrected)
 
 
 def _linear(name: str, away_mm: float, target: Target, geometry: Geometry) -> BudgetLine:
     """A table that is `away_mm` too far: a scale."""
     distance_mm, radius_mm = geometry.distance_mm.value, _outermost_mm(target)
     px = away_mm / distance_mm * radius_mm / distance_mm * geometry.focal_px
-    return BudgetLine(name, 1e3 * away_mm, math.nan, px, math.nan, "the outermost marker", False)
+    return BudgetLine(name, 1e3 * away_mm, px, "the outermost marker")
 
 
 def _rotary(name: str, turned_deg: float, target: Target, geometry: Geometry) -> BudgetLine:
@@ -430,7 +431,7 @@ def _rotary(name: str, turned_deg: float, target: Target, geometry: Geometry) ->
     distance_mm, radius_mm = geometry.distance_mm.value, _outermost_mm(target)
     nearer_mm = radius_mm * math.radians(turned_deg)
     px = nearer_mm / distance_mm * radius_mm / distance_mm * geometry.focal_px
-    return BudgetLine(name, 1e3 * nearer_mm, math.nan, px, math.nan, "the outermost marker", False)
+    return BudgetLine(name, 1e3 * nearer_mm, px, "the outermost marker")
 
 
 def _homes(linear: Repeatability, rotary: Repeatability, target: Target, geometry: Geometry) -> list[BudgetLine]:
@@ -447,7 +448,7 @@ def _repeats(repeats: Repeatability, geometry: Geometry) -> list[BudgetLine]:
         return []
     um = 1e3 * repeats.rms * geometry.distance_mm.value / geometry.focal_px
     name = f"V0 seen again, {repeats.count} times, with the camera"
-    return [BudgetLine(name, um, math.nan, repeats.rms, math.nan, "per coordinate", False)]
+    return [BudgetLine(name, um, repeats.rms, "per coordinate")]
 
 
 def _outermost_mm(target: Target) -> float:

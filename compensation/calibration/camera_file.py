@@ -120,7 +120,7 @@ class RaysPart(Document):
 
 
 class ScorePart(Document):
-    """Hold-out score of a model (compensation/calibration/model_scores.py)."""
+    """Hold-out score of a model (compensation/calibration/calibrate.py)."""
 
     model: str
     rms_px: NotNegative

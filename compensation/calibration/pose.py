@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.centre_corrections import shifts_by_camera
+from thermostand.compensation.calibration.board import Board, shifts_by_camera
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise, whiteners
 from thermostand.compensation.calibration.pinhole import crosses
 from thermostand.foundation.errors import CalibrationError

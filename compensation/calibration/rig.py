@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.bundle import lens_sigma
-from thermostand.compensation.calibration.centre_corrections import shifts_by_camera
+from thermostand.compensation.calibration.adjustment import lens_sigma
+from thermostand.compensation.calibration.board import Board, shifts_by_camera
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise, next_discrepancy, whiteners
 from thermostand.compensation.calibration.pinhole import Pinhole, crosses
 from thermostand.compensation.calibration.views import LEAST_MARKERS, POSE, Views, calibrate_views, inliers

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.bundle import Slopes, equations_of, lens_sigma
-from thermostand.compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
+from thermostand.compensation.calibration.adjustment import Slopes, equations_of, lens_sigma
+from thermostand.compensation.calibration.board import Board, shifts_by_camera, shifts_by_homography
 from thermostand.compensation.calibration.least_squares import (
     Float,
     Solution,
@@ -328,7 +327,15 @@ def _problem(
     view, marker = np.nonzero(used)
     covariance = views.covariance_px2[used] + discrepancy_px**2 * np.eye(2)
     centres = (views.centres_px - shifts_px)[used]
-    return _Problem(view, marker, centres, whiteners(covariance), board.points_mm, board.sigma_mm, lens_sigma(lens))
+    return _Problem(
+        view=view,
+        marker=marker,
+        centres_px=centres,
+        whitener=whiteners(covariance),
+        prior_mm=board.points_mm,
+        sigma_mm=board.sigma_mm,
+        lens_sigma=lens_sigma(lens),
+    )
 
 
 def _residuals(scene: Posed, discs_px: Float) -> Float:

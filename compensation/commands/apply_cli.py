@@ -11,17 +11,14 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from thermostand.compensation.apply.c_header import export_c
 from thermostand.compensation.apply.compensate_images import Form, corrected_image, middle_flags, write_image
-from thermostand.compensation.apply.ros2_package import export_ros2
-from thermostand.compensation.apply.runtime_export import export
+from thermostand.compensation.apply.runtime_export import export, export_c, export_ros2
 from thermostand.compensation.arrays import Row, numbers, read_rows
 from thermostand.compensation.commands.options import CameraName, Incomplete, open_session
 from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift.paper_model import PaperModel
-from thermostand.compensation.history.states import Float, States
-from thermostand.compensation.history.thermal_history import recorded_history, states_at
+from thermostand.compensation.history.thermal_history import Float, States, recorded_history, states_at
 from thermostand.compensation.one_camera import name_of, own_frames, take, temperatures_at_frames
 from thermostand.experiments.steps import Role
 from thermostand.foundation.command_app import App
@@ -99,6 +96,7 @@ def apply_model(
     model: ModelArgument,
     source: Annotated[Path, typer.Argument(metavar="POINTS.csv|IMAGE|SESSION", help="What is to be corrected.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write; of a session a new folder.")],
+    *,
     session: Annotated[
         Path | None, typer.Option(help="Of points with time_ns, or an image: the session that recorded the camera.")
     ] = None,

@@ -41,6 +41,7 @@ _TABLE = TableSigma()
 def calibrate_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a recorded calibration.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The camera file (JSON) to write.")],
+    *,
     export: Annotated[
         Path | None, typer.Option(help="A folder, new or not, for the OpenCV, ROS, Kalibr and mrcal files.")
     ] = None,

@@ -24,22 +24,21 @@ from thermostand.compensation.commands.options import (
 from thermostand.compensation.datasheet.datasheet import datasheet
 from thermostand.compensation.datasheet.details import load_details
 from thermostand.compensation.drift.anchoring import anchored, fit_like, thermal_of
-from thermostand.compensation.drift.bump import Bump
+from thermostand.compensation.drift.bumps import Cause, find_unrepeated
 from thermostand.compensation.drift.choosing import Form, check_request
 from thermostand.compensation.drift.choosing import fit as fit_model
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate, table
+from thermostand.compensation.drift.facts import Bump
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.paper_model import MAX_DEGREE
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.drift.unrepeated import Cause, find_unrepeated
 from thermostand.compensation.observations import Observations, session_target
 from thermostand.compensation.one_camera import take
-from thermostand.compensation.reporting.drawing.drawing import drawing
+from thermostand.compensation.reporting.drawing.figures import drawing
 from thermostand.compensation.reporting.equipment import equipment_of
 from thermostand.compensation.reporting.numbers import Extras, table_positions
-from thermostand.compensation.reporting.page import pdf_of
-from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page
+from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page, pdf_of
 from thermostand.compensation.reporting.report import (
     NoModel,
     can_be_scored,
@@ -98,10 +97,10 @@ _FORMATS = (".html", ".pdf", ".json")
 def write_datasheet(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions of one camera.")],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.html|pdf|json", help="The file to write.")],
+    *,
     model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
     details: DetailsOption = None,
     camera: CameraName = None,
-    *,
     finding: MarkerSearch,
 ) -> None:
     """Write a camera's thermal datasheet: px/K and ppm/K, settling, hysteresis, what each form of compensation leaves,
@@ -145,6 +144,7 @@ def fit(
         typer.Argument(metavar="SESSION...|CENTRES.csv", help="Folders of recorded sessions, or a table of centres."),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write.")],
+    *,
     form: FormOption = None,
     degree: DegreeOption = None,
     like: Annotated[
@@ -152,7 +152,6 @@ def fit(
         typer.Option(metavar="MODEL", help="A model of another unit of its type; of three or more."),
     ] = None,
     camera: CameraName = None,
-    *,
     finding: MarkerSearch,
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
@@ -201,8 +200,8 @@ def anchor(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")],
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session, with a few reference frames.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write, for this session.")],
-    camera: CameraName = None,
     *,
+    camera: CameraName = None,
     finding: MarkerSearch,
 ) -> None:
     """Fit a model to where the target is in a new session, with a few reference frames of the session itself.
@@ -271,6 +270,7 @@ def _extras(
 def report(
     sessions: Sessions,
     out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write.")],
+    *,
     model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
     budget: Annotated[
         str | None, typer.Option(help="With the stand's budget, by its geometry: a file, or the installed `paper`.")
@@ -280,7 +280,6 @@ def report(
     ] = None,
     details: DetailsOption = None,
     camera: CameraName = None,
-    *,
     finding: MarkerSearch,
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.

@@ -11,9 +11,9 @@ import numpy as np
 import typer
 
 from thermostand.compensation.calibration.board import Board, board_of, board_of_corners
+from thermostand.compensation.calibration.calibrate import known_or_why
 from thermostand.compensation.calibration.exports import EXPORTS, write_exports
 from thermostand.compensation.calibration.least_squares import Float
-from thermostand.compensation.calibration.model_scores import known_or_why
 from thermostand.compensation.calibration.pinhole import NAMES
 from thermostand.compensation.calibration.rig import RigCalibration, calibrate_rig
 from thermostand.compensation.calibration.views import (

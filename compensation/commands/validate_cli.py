@@ -23,8 +23,8 @@ from thermostand.compensation.validation3d.validate import (
     check_same,
     stand_part,
     validate,
+    validation_frames,
 )
-from thermostand.compensation.validation3d.validation_frames import validation_frames
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.files import check_writable, write_whole

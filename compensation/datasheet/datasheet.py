@@ -3,74 +3,241 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Literal
 
 import numpy as np
 
 from thermostand.compensation.datasheet.details import Details
-from thermostand.compensation.datasheet.motions import MOTIONS, UNITS, Visits, Warming, motions, visits_of, warming_of
-from thermostand.compensation.datasheet.quantity import Contribution, MeasuredQuantity, direct, pooled
 from thermostand.compensation.drift.bumps import around_bumps
 from thermostand.compensation.drift.choosing import FORMS
+from thermostand.compensation.drift.displacements import reference_centres
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.hysteresis import Hysteresis, hysteresis
-from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.observations import Float, Mask, Observations
+from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
+
+# A measured quantity with its uncertainty budget, after the GUM (JCGM 100:2008): contributions of type A (statistics
+# of this measurement) and type B (anything else), each an input's standard uncertainty times a sensitivity coefficient.
+
+COVERAGE = 2.0
+"""Expanded uncertainties are this many standard ones: about 95 % of a normal distribution."""
+NIGHTS = "night to night"
+
+
+@dataclass(frozen=True, slots=True)
+class Contribution:
+    """One line of a budget. u: standard uncertainty of the input, in its own unit. basis: how u is known. sensitivity:
+    unit of the quantity per unit of the input, 1 where it is the same."""
+
+    source: str
+    kind: Literal["A", "B"]
+    u: float
+    unit: str
+    basis: str
+    sensitivity: float = 1.0
+
+    @property
+    def amount(self) -> float:
+        """In the quantity's unit."""
+        return abs(self.sensitivity) * self.u
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredQuantity:
+    """key: its name in the JSON file. model: the measurement equation, in words and symbols. group: the heading it
+    stands under. value: NaN when it could not be measured, and `why` says so."""
+
+    key: str
+    group: str
+    name: str
+    unit: str
+    model: str
+    value: float = math.nan
+    contributions: tuple[Contribution, ...] = ()
+    why: str = ""
+
+    def found(self, value: float, *contributions: Contribution) -> MeasuredQuantity:
+        """With this value and its budget."""
+        return replace(self, value=value, contributions=contributions, why="")
+
+    @property
+    def u(self) -> float:
+        """Combined standard uncertainty."""
+        if math.isnan(self.value):
+            return math.nan
+        return math.sqrt(sum(one.amount**2 for one in self.contributions))
+
+    @property
+    def expanded(self) -> float:
+        """U, k = 2."""
+        return COVERAGE * self.u
+
+
+def pooled(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
+    """The mean of the same quantity over nights. What each night's statistics say shrinks with their number, what is of
+    type B is common to all; how they differ is a contribution of its own."""
+    known = [one for one in nights if not math.isnan(one.value)]
+    if len(known) < 2:
+        return known[0] if known else nights[0]
+    values = [one.value for one in known]
+    count = len(known)
+    lines: list[Contribution] = []
+    for same in zip(*(one.contributions for one in known), strict=True):
+        amounts = np.array([line.amount for line in same])
+        a_night = math.sqrt(float((amounts**2).mean()))
+        amount = a_night / math.sqrt(count) if same[0].kind == "A" else a_night
+        sensitivity = same[0].sensitivity or 1.0
+        lines.append(replace(same[0], u=amount / abs(sensitivity), sensitivity=sensitivity))
+    spread = float(np.std(values, ddof=1)) / math.sqrt(count)
+    basis = f"standard deviation of the mean of {count} nights"
+    lines.append(Contribution(NIGHTS, "A", spread, known[0].unit, basis))
+    return replace(known[0], value=float(np.mean(values)), contributions=tuple(lines))
+
+
+# How the image as a whole has moved: shift at its middle, change of scale, turn, at each visit of a set-point and
+# through a warm-up.
+
+SET_POINTS = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
+MOTIONS = ("shift_I", "shift_J", "scale", "turn")
+UNITS = ("px", "px", "ppm", "µrad")
+_FEWEST_MARKERS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visits:
+    """V visits of set-points of one session, in order of time. moved (V, 4): of MOTIONS, px, px, ppm, urad, from the
+    session's reference. air_degC, camera_degC (V,)."""
+
+    air_degC: Float
+    camera_degC: Float
+    chamber_degC: Float
+    moved: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Warming:
+    """F frames of a session's warm-up. since_s (F,): the supply came on; from the first frame when that is not recorded
+    (`known` is False). moved (F, 4): as in Visits, from the first frame."""
+
+    since_s: Float
+    known: bool
+    air_degC: Float
+    camera_degC: Float
+    moved: Float
+
+
+def motions(observations: Observations) -> Float:
+    """(F, 4): of every usable frame from its session's reference, NaN elsewhere. Least squares of a similarity about
+    the image's middle: dx = a + s x - r y, dy = b + s y + r x."""
+    found = np.full((len(observations.frame), 4), np.nan)
+    width, height = observations.image_size
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    reference = reference_centres(observations)[0]
+    for frame in np.flatnonzero(observations.usable):
+        start = reference[observations.session[frame]]
+        moved = observations.centres_px[frame] - start
+        seen = np.isfinite(moved).all(axis=1) & np.isfinite(start).all(axis=1)
+        if seen.sum() < _FEWEST_MARKERS:
+            continue
+        x, y = (start[seen] - middle).T
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        terms = np.concatenate([np.stack([one, zero, x, -y], axis=1), np.stack([zero, one, y, x], axis=1)])
+        fitted = np.linalg.lstsq(terms, moved[seen].T.ravel(), rcond=None)[0]
+        found[frame] = fitted * (1.0, 1.0, 1e6, 1e6)
+    return found
+
+
+def visits_of(observations: Observations, moved: Float, session: int) -> Visits:
+    """Frames of one set-point that follow each other are a visit; those without air or markers do not count."""
+    own = observations.of(*SET_POINTS) & (observations.session == session) & np.isfinite(moved[:, 0])
+    own &= np.isfinite(observations.air_degC)
+    rows: list[Float] = []
+    for _, group in groupby(np.flatnonzero(own).tolist(), key=lambda k: float(observations.chamber_degC[k])):
+        at = list(group)
+        columns = (observations.air_degC[at], observations.camera_degC[at], observations.chamber_degC[at])
+        rows.append(np.concatenate([[column.mean() for column in columns], moved[at].mean(axis=0)]))
+    table = np.array(rows).reshape(-1, 7)
+    return Visits(table[:, 0], table[:, 1], table[:, 2], table[:, 3:])
+
+
+def warming_of(observations: Observations, moved: Float, session: int) -> Warming | None:
+    """The session's first warm-up; None without one at the reference's place."""
+    own: Mask = observations.of(Role.WARM_UP) & (observations.session == session) & np.isfinite(moved[:, 0])
+    frames = np.flatnonzero(own)
+    if len(frames) < 5:
+        return None
+    first = observations.step_id[frames[0]]
+    frames = np.array([frame for frame in frames.tolist() if observations.step_id[frame] == first])
+    if len(frames) < 5 or np.abs(moved[frames, :2]).max() > 10:
+        return None
+    times_ns = observations.time_ns[frames]
+    on_ns = observations.switched_on_ns(session, int(times_ns[0]))
+    since_s = (times_ns - (int(times_ns[0]) if on_ns is None else on_ns)) / 1e9
+    return Warming(
+        since_s,
+        on_ns is not None,
+        observations.air_degC[frames],
+        observations.camera_degC[frames],
+        moved[frames] - moved[frames[0]],
+    )
+
 
 _FEWEST = 3
 
 
 def hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float]) -> list[MeasuredQuantity]:
     """RMS of heating minus cooling over set-points reached from both sides, mpx. scatter_px: what does not repeat."""
+    group, title = "Dependence on the way", "Heating against cooling"
     model = "root mean square of (heating − cooling) over set-points reached from both sides, mean over the markers"
-    quantities: list[MeasuredQuantity] = []
-    for axis, name in enumerate("IJ"):
-        key, title = f"hysteresis_{name}", f"Heating against cooling, {name}"
-        gaps = [] if found is None else found.gaps
+    why = "fewer than three set-points were reached from both sides"
+    quantities = [
+        MeasuredQuantity(f"hysteresis_{name}", group, f"{title}, {name}", "mpx", model, why=why) for name in "IJ"
+    ]
+    gaps = () if found is None else found.gaps
+    if len(gaps) < _FEWEST:
+        return quantities
+    for axis, one in enumerate(quantities):
         differences = 1e3 * np.array([gap.difference_px[axis] for gap in gaps])
-        one = MeasuredQuantity(key, "Dependence on the way", title, "mpx", math.nan, model)
-        if len(differences) < _FEWEST:
-            why = "fewer than three set-points were reached from both sides"
-            quantities.append(MeasuredQuantity(key, one.group, title, "mpx", math.nan, model, (), why))
-            continue
         noise = 1e3 * float(np.sqrt(np.mean([gap.uncertainty_px[axis] ** 2 for gap in gaps])))
         repeats = 1e3 * scatter_px[axis] * math.sqrt(2 / len(differences))
-        lines = (
-            direct("choice of set-points", "A", _jackknife(differences, _rms), "mpx", "each left out once"),
-            direct("noise of the markers", "A", noise / math.sqrt(len(differences)), "mpx", "as the marker fit claims"),
-            direct("what does not repeat", "A", repeats, "mpx", UNREPEATED),
+        quantities[axis] = one.found(
+            _rms(differences),
+            Contribution("choice of set-points", "A", _jackknife(differences, _rms), "mpx", "each left out once"),
+            Contribution("noise of the markers", "A", noise / math.sqrt(len(gaps)), "mpx", "as the marker fit claims"),
+            Contribution("what does not repeat", "A", repeats, "mpx", UNREPEATED),
         )
-        quantities.append(MeasuredQuantity(key, one.group, title, "mpx", _rms(differences), model, lines))
     return quantities
 
 
 def residual_quantities(
     form: str, evaluation: Evaluation | None, scatter_px: Sequence[float]
-) -> list[MeasuredQuantity]:
+) -> Iterator[MeasuredQuantity]:
     """RMS along I and J at held-out set-points, mpx; the marker's noise of single frames is in it."""
+    group, title = "Left after compensation", f"The {form} form"
     model = (
         "root mean square of (reference − corrected) over all centres at held-out set-points, with their noise in it"
     )
-    group = "Left after compensation"
-    quantities: list[MeasuredQuantity] = []
     for axis, name in enumerate("IJ"):
-        key, title = f"left_{form}_{name}", f"The {form} form, {name}: RMS at held-out set-points"
+        key, title_here = f"left_{form}_{name}", f"{title}, {name}: RMS at held-out set-points"
+        one = MeasuredQuantity(key, group, title_here, "mpx", model)
         if evaluation is None or len(evaluation.temperatures) < _FEWEST:
             why = "the sessions do not support this form, or have fewer than three set-points to score it"
-            quantities.append(MeasuredQuantity(key, group, title, "mpx", math.nan, model, (), why))
+            yield replace(one, why=why)
             continue
         each = 1e3 * np.array([row.after_px[axis] for row in evaluation.temperatures])
         value = 1e3 * evaluation.rms_after_px[axis]
         # What does not repeat adds to the residual as a square: it matters less the larger that is.
         repeats = math.sqrt(value**2 + (1e3 * scatter_px[axis]) ** 2 / len(each)) - value
-        lines = (
-            direct("choice of set-points", "A", _jackknife(each, _rms), "mpx", "each left out once"),
-            direct("what does not repeat", "A", repeats, "mpx", UNREPEATED),
+        yield one.found(
+            value,
+            Contribution("choice of set-points", "A", _jackknife(each, _rms), "mpx", "each left out once"),
+            Contribution("what does not repeat", "A", repeats, "mpx", UNREPEATED),
         )
-        quantities.append(MeasuredQuantity(key, group, title, "mpx", value, model, lines))
-    return quantities
 
 
 def _rms(values: Float) -> float:
@@ -131,30 +298,26 @@ def curve(visits: Visits, motion: int) -> Curve | None:
     return Curve(float(found[1]), u_slope, float(found[4]) if both else 0.0, scatter, float(np.ptp(visits.air_degC)))
 
 
-def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> list[MeasuredQuantity]:
+def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> Iterator[MeasuredQuantity]:
     """Of the four motions."""
-    found: list[MeasuredQuantity] = []
     for motion, (key, name, unit) in enumerate(zip(MOTIONS, NAMES, UNITS, strict=True)):
-        fitted = curve(visits, motion)
-        one = MeasuredQuantity(f"{key}_per_K", _GROUP, name, f"{unit}/K", math.nan, _MODEL, why=_TOO_FEW)
+        fitted, per_K = curve(visits, motion), f"{unit}/K"
+        one = MeasuredQuantity(f"{key}_per_K", _GROUP, name, per_K, _MODEL, why=_TOO_FEW)
         if fitted is None:
-            found.append(one)
+            yield one
             continue
         lines = [
-            Contribution("scatter of the visits about the curve", "A", fitted.u_slope, f"{unit}/K", 1.0,
+            Contribution("scatter of the visits about the curve", "A", fitted.u_slope, per_K,
                          "least squares, with the correlation of neighbouring visits"),
-            Contribution("slope of heating against cooling", "B", abs(fitted.branches) / math.sqrt(3), f"{unit}/K", 1.0,
+            Contribution("slope of heating against cooling", "B", abs(fitted.branches) / math.sqrt(3), per_K,
                          "rectangular, between the slopes of the two branches"),
             Contribution("span of the air's temperature", "B", math.sqrt(2) * u_air_K, "K",
-                         fitted.slope / fitted.span_K, "thermometer and its place, both ends of the range"),
+                         "thermometer and its place, both ends of the range", fitted.slope / fitted.span_K),
         ]  # fmt: skip
         if key == "scale":
-            lines.append(
-                Contribution("expansion of the target", "B", target_ppm_per_K, "ppm/K", 1.0,
-                             "the part of the air's change that may reach the target")
-            )  # fmt: skip
-        found.append(replace(one, value=fitted.slope, contributions=tuple(lines), why=""))
-    return found
+            basis = "the part of the air's change that may reach the target"
+            lines.append(Contribution("expansion of the target", "B", target_ppm_per_K, "ppm/K", basis))
+        yield one.found(fitted.slope, *lines)
 
 
 UNREPEATED = "what the chosen form leaves unexplained"
@@ -166,6 +329,7 @@ _MOST_EXPONENTIALS = 10
 _NO_WARM_UP = "no warm-up was recorded at the reference's place"
 _OF_RESIDUALS = "residuals of a line and exponentials"
 _NO_CURVE = "no temperature coefficient to compare with"
+_OF_PLACE = "thermometer and its place"
 
 
 def warming_quantities(
@@ -183,26 +347,29 @@ def warming_quantities(
     ]
 
 
-def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -> list[MeasuredQuantity]:
-    found: list[MeasuredQuantity] = []
+def _switching_on(key: str, name: str, unit: str, model: str = "", why: str = _NO_WARM_UP) -> MeasuredQuantity:
+    """Not known yet, and why that may stay so."""
+    return MeasuredQuantity(key, _SWITCHING_ON, name, unit, model, why=why)
+
+
+def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -> Iterator[MeasuredQuantity]:
     for motion, name in enumerate(_NAMES):
         key, unit = f"warm_up_{MOTIONS[motion]}", UNITS[motion]
         if warming is None:
-            found.append(MeasuredQuantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP))
+            yield _switching_on(key, name, unit)
             continue
         value = float(warming.moved[-1, motion])
         minutes = warming.since_s[[0, -1]] / 60
         risen_K = max(float(warming.camera_degC[-1] - warming.camera_degC[0]), 1.0)
+        noise = math.sqrt(2) * frame_noise(warming.since_s, warming.moved[:, motion])
         model = f"y at {minutes[1]:z.1f} min minus y at {minutes[0]:z.1f} min"
         model += " after switching on" if warming.known else " of the recording"
-        lines = (
-            direct("what does not repeat", "A", math.sqrt(2) * scatter[motion], unit, UNREPEATED),
-            direct("noise of the frames", "A", math.sqrt(2) * frame_noise(warming.since_s, warming.moved[:, motion]),
-                   unit, _OF_RESIDUALS),
-            Contribution("temperature it began at", "B", u_air_K, "K", value / risen_K, "thermometer and its place"),
-        )  # fmt: skip
-        found.append(MeasuredQuantity(key, _SWITCHING_ON, name, unit, value, model, lines))
-    return found
+        yield _switching_on(key, name, unit, model).found(
+            value,
+            Contribution("what does not repeat", "A", math.sqrt(2) * scatter[motion], unit, UNREPEATED),
+            Contribution("noise of the frames", "A", noise, unit, _OF_RESIDUALS),
+            Contribution("temperature it began at", "B", u_air_K, "K", _OF_PLACE, value / risen_K),
+        )
 
 
 def frame_noise(since_s: Float, values: Float) -> float:
@@ -226,30 +393,28 @@ def frame_noise(since_s: Float, values: Float) -> float:
 
 
 def _settling(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
-    key, name = "settling_s", "Time to 90 % of the drift in the recorded warm-up"
+    model = f"first time after which the drift along its direction stays above {_SETTLED:.0%} of its last value"
+    one = _switching_on("settling_s", "Time to 90 % of the drift in the recorded warm-up", "s", model)
     if warming is None:
-        return MeasuredQuantity(key, _SWITCHING_ON, name, "s", math.nan, "", (), _NO_WARM_UP)
+        return replace(one, model="")
     whole = warming.moved[-1, :2]
     size = float(np.linalg.norm(whole))
     along = warming.moved[:, :2] @ whole / max(size, 1e-12)
-    model = f"first time after which the drift along its direction stays above {_SETTLED:.0%} of its last value"
     noise = math.sqrt(2) * frame_noise(warming.since_s, along)
     if size < 10 * noise:
-        return MeasuredQuantity(
-            key, _SWITCHING_ON, name, "s", math.nan, model, (), "the warm-up moves the image by no more than noise"
-        )
+        return replace(one, why="the warm-up moves the image by no more than noise")
     below = int(np.flatnonzero(along < _SETTLED * size)[-1])
     after = min(below + 1, len(along) - 1)
     step_s, step_px = warming.since_s[after] - warming.since_s[below], along[after] - along[below]
     value = float(warming.since_s[below] + step_s * (_SETTLED * size - along[below]) / max(float(step_px), 1e-12))
     rate = max(_slope(warming.since_s, along, value), 1e-9)
-    lines = (
-        Contribution("drift at that time", "A", noise, "px", 1 / rate, _OF_RESIDUALS),
-        Contribution("what does not repeat", "A", float(np.hypot(scatter[0], scatter[1])), "px", 1 / rate,
-                     UNREPEATED),
-        direct("instant of switching on", "B", 0.5, "s", "a second between commands and readings"),
-    )  # fmt: skip
-    return MeasuredQuantity(key, _SWITCHING_ON, name, "s", value, model, lines)
+    repeats = float(np.hypot(scatter[0], scatter[1]))
+    return one.found(
+        value,
+        Contribution("drift at that time", "A", noise, "px", _OF_RESIDUALS, 1 / rate),
+        Contribution("what does not repeat", "A", repeats, "px", UNREPEATED, 1 / rate),
+        Contribution("instant of switching on", "B", 0.5, "s", "a second between commands and readings"),
+    )
 
 
 def _slope(at_s: Float, values: Float, middle_s: float) -> float:
@@ -260,77 +425,74 @@ def _slope(at_s: Float, values: Float, middle_s: float) -> float:
 
 
 def _rate(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
-    key, name, unit = "rate_at_end", "Drift still going on at the end of the warm-up", "mpx/min"
+    unit = "mpx/min"
+    one = _switching_on("rate_at_end", "Drift still going on at the end of the warm-up", unit)
     if warming is None:
-        return MeasuredQuantity(key, _SWITCHING_ON, name, unit, math.nan, "", (), _NO_WARM_UP)
+        return one
     last = warming.since_s >= warming.since_s[-1] - _LAST_S
     if last.sum() < 4:
-        return MeasuredQuantity(
-            key, _SWITCHING_ON, name, unit, math.nan, "", (), "fewer than four frames in its last five minutes"
-        )
+        return replace(one, why="fewer than four frames in its last five minutes")
     minutes = (warming.since_s[last] - warming.since_s[-1]) / 60
     terms = np.stack([np.ones_like(minutes), minutes], axis=1)
     fitted = np.linalg.lstsq(terms, 1e3 * warming.moved[last, :2], rcond=None)[0]
     left = 1e3 * warming.moved[last, :2] - terms @ fitted
     variance = float((left**2).sum()) / max(2 * int(last.sum()) - 4, 1)
     u = math.sqrt(variance * float(np.linalg.inv(terms.T @ terms)[1, 1]))
-    within_min = float(np.ptp(minutes))
-    lines = (
-        direct("scatter of the frames about a line", "A", u, unit, "least squares"),
-        Contribution("what does not repeat", "A", 1e3 * math.hypot(scatter[0], scatter[1]), "mpx", 0.1 / within_min,
-                     "a tenth of what the chosen form leaves may fall into these minutes"),
-    )  # fmt: skip
+    repeats, within_min = 1e3 * math.hypot(scatter[0], scatter[1]), float(np.ptp(minutes))
+    basis = "a tenth of what the chosen form leaves may fall into these minutes"
     model = "length of the slope of a line through I and J over the last five minutes"
-    return MeasuredQuantity(key, _SWITCHING_ON, name, unit, float(np.linalg.norm(fitted[1])), model, lines)
+    return replace(one, model=model).found(
+        float(np.linalg.norm(fitted[1])),
+        Contribution("scatter of the frames about a line", "A", u, unit, "least squares"),
+        Contribution("what does not repeat", "A", repeats, "mpx", basis, 0.1 / within_min),
+    )
 
 
 def _self_heating(visits: Visits, u_air_K: float) -> MeasuredQuantity:
-    name, model = "Self-heating, by its own sensor", "camera's own sensor minus the air near it, at the reference"
+    model, why = "camera's own sensor minus the air near it, at the reference", "no air temperature near the camera"
+    one = _switching_on("self_heating_K", "Self-heating, by its own sensor", "K", model, why)
     excess = visits.camera_degC - visits.air_degC
     if not len(excess):
-        return MeasuredQuantity(
-            "self_heating_K", _SWITCHING_ON, name, "K", math.nan, model, (), "no air temperature near the camera"
-        )
-    lines = (
-        direct("thermometer and its place", "B", u_air_K, "K", "stated, else assumed"),
-        direct("the camera's sensor", "B", 0.25 / math.sqrt(12), "K", "steps of at most 0.25 K; its offset is unknown"),
+        return one
+    basis = "steps of at most 0.25 K; its offset is unknown"
+    return one.found(
+        float(excess[0]),
+        Contribution(_OF_PLACE, "B", u_air_K, "K", "stated, else assumed"),
+        Contribution("the camera's sensor", "B", 0.25 / math.sqrt(12), "K", basis),
     )
-    return MeasuredQuantity("self_heating_K", _SWITCHING_ON, name, "K", float(excess[0]), model, lines)
 
 
 def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float) -> MeasuredQuantity:
     """Of the shift per K of the air, how much the camera's own warming moves the image per K of its own sensor. The
     rest follows the surroundings: mount, fixture, and what of the camera stays at the air's temperature then."""
-    key, name = "camera_share", "Part of the shift that follows the camera itself"
     model = (
         "(h · c) / (c · c); h: shift in the warm-up per K of the camera's sensor, c: shift per K of the air; the rest "
         "follows mount and surroundings, which are taken to stay at the air's temperature in the warm-up; above 100 % "
         "they move the image back"
     )
+    one = _switching_on("camera_share", "Part of the shift that follows the camera itself", "%", model)
     fitted = [curve(visits, axis) for axis in (0, 1)]
-    if warming is None or fitted[0] is None or fitted[1] is None:
-        return MeasuredQuantity(
-            key, _SWITCHING_ON, name, "%", math.nan, model, (), _NO_WARM_UP if warming is None else _NO_CURVE
-        )
+    if warming is None:
+        return one
+    if fitted[0] is None or fitted[1] is None:
+        return replace(one, why=_NO_CURVE)
     slope = np.array([one.slope for one in fitted if one])
-    u_slope = np.array([one.u_slope for one in fitted if one])
+    u_slope = [one.u_slope for one in fitted if one]
     risen_K = float(warming.camera_degC[-1] - warming.camera_degC[0])
     size = float(slope @ slope)
     if risen_K < 2 or size < 1e-10:
-        return MeasuredQuantity(
-            key, _SWITCHING_ON, name, "%", math.nan, model, (), "the camera warmed by less than 2 K"
-        )
+        return replace(one, why="the camera warmed by less than 2 K")
     h = warming.moved[-1, :2] / risen_K
     share = float(h @ slope) / size
-    by_slope = (h - 2 * share * slope) / size
-    lines = (
-        Contribution("drift in the warm-up", "A", math.sqrt(2) * max(scatter[:2]), "px",
-                     100 / (risen_K * math.sqrt(size)), UNREPEATED),
-        Contribution("coefficient along I", "A", float(u_slope[0]), "px/K", 100 * float(by_slope[0]), "as above"),
-        Contribution("coefficient along J", "A", float(u_slope[1]), "px/K", 100 * float(by_slope[1]), "as above"),
-        Contribution("warming of the camera", "B", u_air_K, "K", 100 * share / risen_K, "of its own sensor"),
-    )  # fmt: skip
-    return MeasuredQuantity(key, _SWITCHING_ON, name, "%", 100 * share, model, lines)
+    by_slope = (100 * (h - 2 * share * slope) / size).tolist()
+    drift, by_drift = math.sqrt(2) * max(scatter[:2]), 100 / (risen_K * math.sqrt(size))
+    return one.found(
+        100 * share,
+        Contribution("drift in the warm-up", "A", drift, "px", UNREPEATED, by_drift),
+        Contribution("coefficient along I", "A", u_slope[0], "px/K", "as above", by_slope[0]),
+        Contribution("coefficient along J", "A", u_slope[1], "px/K", "as above", by_slope[1]),
+        Contribution("warming of the camera", "B", u_air_K, "K", "of its own sensor", 100 * share / risen_K),
+    )
 
 
 def _rest(share: MeasuredQuantity) -> MeasuredQuantity:

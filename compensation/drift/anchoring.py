@@ -21,7 +21,7 @@ from thermostand.compensation.drift.facts import facts_of
 from thermostand.compensation.drift.terms import MOTIONS, ConstantTerm, features
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import condense_instants, frame_states, training
-from thermostand.compensation.history.states import Float
+from thermostand.compensation.history.thermal_history import Float
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from thermostand.compensation.drift.displacements import Displacements
-from thermostand.compensation.history.states import Float
+from thermostand.compensation.history.thermal_history import Float
 from thermostand.foundation.documents import Document
 
 Pair = tuple[float, float]

@@ -8,13 +8,12 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from thermostand.compensation.drift.bump import Bump
 from thermostand.compensation.drift.bumps import around_bumps, find_bumps
 from thermostand.compensation.drift.candidates import NO_MATTER_PX, Candidate, moving_rms_px
 from thermostand.compensation.drift.displacements import displacements
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.paper_fit import check_degree, fit_paper, left_out
-from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.facts import Bump
+from thermostand.compensation.drift.paper_model import PaperModel, check_degree, fit_paper, left_out
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import training

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from thermostand.compensation.drift.candidates import Candidate, Pair
 from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.hull import MARGIN_PX, distances_px
-from thermostand.compensation.history.states import Float, States, ThermalMemory
+from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory
 
 Flags = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -61,7 +61,7 @@ class DriftModel(ABC):
     @property
     @abstractmethod
     def memory(self) -> ThermalMemory:
-        """What has to be remembered for it: history.states_at and states.state_of take it."""
+        """What has to be remembered for it: thermal_history.states_at and state_of take it."""
 
     @abstractmethod
     def shift(self, xy_px: Float, state: Situation) -> Float:

@@ -11,8 +11,7 @@ from thermostand.compensation.drift.bumps import around_bumps
 from thermostand.compensation.drift.candidates import Pair, pair_of, rms_px
 from thermostand.compensation.drift.displacements import Displacements, displacements
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.paper_fit import degrees_for, left_out, scaling_of
-from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.paper_model import PaperModel, degrees_for, left_out, scaling_of
 from thermostand.compensation.drift.thermal_learning import left_out_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from thermostand.compensation.history.states import Float
+from thermostand.compensation.history.thermal_history import Float
 
 MARGIN_PX = 1.0
 """The markers themselves move by this much over the calibrated temperatures."""

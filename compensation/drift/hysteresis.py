@@ -18,7 +18,7 @@ from thermostand.compensation.drift.bumps import around_bumps
 from thermostand.compensation.drift.displacements import displacements
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.training import frame_states
-from thermostand.compensation.history.states import Float
+from thermostand.compensation.history.thermal_history import Float
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
 

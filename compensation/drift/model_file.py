@@ -15,10 +15,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, TypeAdapter
 
-from thermostand.compensation.drift.bump import Bump
 from thermostand.compensation.drift.candidates import Candidate, Pair
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.facts import Bump, ModelFacts
 from thermostand.compensation.drift.hull import is_area
 from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel, exponents
 from thermostand.compensation.drift.terms import MOTIONS, Term, term_of

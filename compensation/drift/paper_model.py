@@ -2,11 +2,12 @@
 
 The paper's form (section 6.1), one polynomial per coordinate of total degree n in the measured position (I, J) and the
 camera's own temperature T, fitted to the displacement (reference minus measured). For n >= 1 the position itself is in
-the space, so this is the same fit as that of the reference positions. compensation/drift/paper_fit.py makes the model.
+the space, so this is the same fit as that of the reference positions.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, cast
@@ -16,7 +17,16 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from thermostand.compensation.drift.candidates import Pair, check_folds
+from thermostand.compensation.drift.candidates import (
+    Candidate,
+    Pair,
+    as_good_as_best,
+    check_folds,
+    discrepancy_px,
+    fold_means,
+    pair_of,
+)
+from thermostand.compensation.drift.displacements import Displacements, displacements
 from thermostand.compensation.drift.drift_model import (
     DriftModel,
     Flags,
@@ -26,8 +36,12 @@ from thermostand.compensation.drift.drift_model import (
     range_flags,
     states_of,
 )
-from thermostand.compensation.history.states import ThermalMemory
+from thermostand.compensation.drift.facts import facts_of
+from thermostand.compensation.history.thermal_history import ThermalMemory
+from thermostand.compensation.observations import Observations
+from thermostand.experiments.steps import Role
 from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError, SessionError
 
 Float = NDArray[np.float64]
 
@@ -182,3 +196,169 @@ class PaperModel(DriftModel):
     def _terms(self, xy_px: Float, state: Situation) -> Float:
         camera_degC = states_of(state, len(xy_px), self.memory).camera_degC
         return design(xy_px, camera_degC, self.degree, self.scaling)
+
+
+# The paper's polynomial: choose its degree by temperatures left out, fit it, and say how far it can be trusted.
+
+_LEAST_TEMPERATURES = 3
+_LEAST_RANGE_K = 1.0
+
+
+def fit_paper(observations: Observations, degree: int | None = None) -> PaperModel:
+    """The model of the REFERENCE and FIT frames; nothing else is looked at.
+
+    degree: 1..5; None takes the simplest within one standard error of the best (cross-validation, see `choose`).
+    SessionError when the sessions cannot support it.
+    """
+    frames = observations.of(Role.REFERENCE, Role.FIT)
+    rows = displacements(observations, frames)
+    scaling = scaling_of(observations, rows)
+    scores = cross_validate(rows, scaling, degrees_for(rows, degree))
+    chosen = choose(scores) if degree is None else _given(scores, degree)
+    solutions = _solutions(_condensed(rows, chosen, scaling))
+    held_out = left_out(rows, chosen, scaling)
+    reference_degC = float(observations.camera_degC[observations.of(Role.REFERENCE)].mean())
+    return PaperModel(
+        facts=facts_of(observations, rows, scaling.camera_degC, reference_degC),
+        degree=chosen,
+        coefficients=np.array([solution.coefficients for solution in solutions]),
+        coefficient_covariance=np.array([solution.covariance for solution in solutions]),
+        discrepancy_px=discrepancy_px(rows, held_out),
+        scores=scores,
+        candidates=candidates_of(scores, chosen),
+    )
+
+
+def check_degree(degree: int | None) -> None:
+    """ConfigError when there is no model of this degree; None, the choice by cross-validation, is fine."""
+    if degree is not None and not 1 <= degree <= MAX_DEGREE:
+        raise ConfigError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
+
+
+def degrees_for(rows: Displacements, degree: int | None) -> range:
+    """The degrees that the temperatures can decide on: T^n needs n + 1 of them, and one more to be left out.
+
+    SessionError when `degree` (None: any at all) is not among them.
+    """
+    check_degree(degree)
+    set_points = np.unique(rows.chamber_degC)
+    least = _LEAST_TEMPERATURES if degree is None else degree + 2
+    if len(set_points) < least:
+        listed = ", ".join(f"{value:g}" for value in set_points)
+        of_degree = "" if degree is None else f" of degree {degree}"
+        raise SessionError(
+            f"a fit{of_degree} needs frames at {least} chamber temperatures or more, "
+            f"found {len(set_points)} ({listed} degC)"
+        )
+    return range(1, min(MAX_DEGREE, len(set_points) - 2) + 1)
+
+
+def scaling_of(observations: Observations, rows: Displacements) -> Scaling:
+    """The image and the range of the camera's temperature in these rows; SessionError when that hardly changes."""
+    if len(rows.frame) == 0:
+        raise SessionError(
+            "the sessions have no usable frames for a fit, which needs the roles reference and fit; usable frames: "
+            f"{observations.roles_text}"
+        )
+    low, high = float(rows.camera_degC.min()), float(rows.camera_degC.max())
+    if high - low < _LEAST_RANGE_K:
+        raise SessionError(f"the camera's temperature hardly changes ({low:.2f} to {high:.2f} degC); nothing to fit")
+    return Scaling(observations.image_size, (low, high))
+
+
+def cross_validate(rows: Displacements, scaling: Scaling, degrees: range) -> tuple[DegreeScore, ...]:
+    """The score of each degree, up to the first that the markers cannot determine."""
+    scores: list[DegreeScore] = []
+    for degree in degrees:
+        try:
+            scores.append(_score(rows, degree, scaling))
+        except np.linalg.LinAlgError:
+            break
+    if not scores:
+        raise SessionError("the markers do not determine even a polynomial of degree 1: too few, or all in one line")
+    return tuple(scores)
+
+
+def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
+    squares = fold_means(rows, left_out(rows, degree, scaling) ** 2)
+    return DegreeScore(
+        degree=degree,
+        terms=len(exponents(degree)),
+        condition=max(solution.condition for solution in _solutions(_condensed(rows, degree, scaling))),
+        rms_px=pair_of(np.sqrt(squares.mean(axis=0))),
+        fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
+        fold_rms_px=tuple(map(pair_of, np.sqrt(squares))),
+    )
+
+
+def left_out(rows: Displacements, degree: int, scaling: Scaling, asked: Displacements | None = None) -> Float:
+    """Residual displacement (M, 2) of each row that is asked for, by default the same, from a fit to the rows that has
+    not seen its chamber set-point; where that is NaN, to all."""
+    asked = rows if asked is None else asked
+    folds = _condensed(rows, degree, scaling)
+    residual = asked.displacement_px.copy()
+    for chamber_degC in np.unique(asked.chamber_degC).tolist():
+        known = _solutions([fold for fold in folds if fold.chamber_degC != chamber_degC])
+        here = np.isnan(asked.chamber_degC) if math.isnan(chamber_degC) else asked.chamber_degC == chamber_degC
+        coefficients = np.stack([solution.coefficients for solution in known], axis=1)
+        residual[here] -= design(asked.measured_px[here], asked.camera_degC[here], degree, scaling) @ coefficients
+    return residual
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fold:
+    """How many rows one chamber set-point has, and their triangles for I and J."""
+
+    chamber_degC: float
+    count: int
+    triangles: tuple[Float, Float]
+
+
+def _condensed(rows: Displacements, degree: int, scaling: Scaling) -> list[_Fold]:
+    """All rows, a fold for each chamber set-point."""
+    folds: list[_Fold] = []
+    for chamber_degC in np.unique(rows.chamber_degC).tolist():
+        here = rows.chamber_degC == chamber_degC
+        terms = design(rows.measured_px[here], rows.camera_degC[here], degree, scaling)
+        values, variance = rows.displacement_px[here], rows.variance_px2[here]
+        i, j = (condense(terms, values[:, axis], variance[:, axis]) for axis in (0, 1))
+        folds.append(_Fold(chamber_degC, int(here.sum()), (i, j)))
+    return folds
+
+
+def _solutions(folds: Sequence[_Fold]) -> list[PolynomialFit]:
+    """The fits of I and of J to all rows of the folds; LinAlgError when they do not determine them."""
+    count = sum(fold.count for fold in folds)
+    return [solve([fold.triangles[axis] for fold in folds], count) for axis in (0, 1)]
+
+
+def choose(scores: tuple[DegreeScore, ...]) -> int:
+    """The simplest degree whose held-out mean square is within one standard error of the best.
+
+    The standard error is that of the difference, fold by fold: what is common to both (a set-point that is hard for
+    every degree) does not count.
+    """
+    squares = [np.array([i**2 + j**2 for i, j in score.fold_rms_px]) for score in scores]
+    return scores[as_good_as_best(squares)[0]].degree
+
+
+def candidates_of(scores: tuple[DegreeScore, ...], degree: int) -> tuple[Candidate, ...]:
+    """The degrees as rows of the table of choice."""
+    return tuple(
+        Candidate(
+            form="paper",
+            name=f"P^{score.degree}",
+            terms=2 * score.terms,
+            rms_px=score.rms_px,
+            chosen=score.degree == degree,
+            fold_chamber_degC=score.fold_chamber_degC,
+            fold_rms_px=score.fold_rms_px,
+        )
+        for score in scores
+    )
+
+
+def _given(scores: tuple[DegreeScore, ...], degree: int) -> int:
+    if degree not in {score.degree for score in scores}:
+        raise SessionError(f"the markers do not determine a polynomial of degree {degree}; at most {len(scores)}")
+    return degree

@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 
 from thermostand.compensation.drift_runtime import compiled, remembered
 from thermostand.compensation.expression import AIR, CAMERA, Expression, Feature, Origin, away, in_words, lag, play
-from thermostand.compensation.history.states import Float, States, ThermalMemory
+from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory
 from thermostand.foundation.document_faults import path_text
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError

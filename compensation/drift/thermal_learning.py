@@ -19,7 +19,7 @@ from thermostand.compensation.drift.terms import MOTIONS, Term, memory_of, motio
 from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange, between_nights, form_name
 from thermostand.compensation.drift.training import Index, Instants, Training, self_heating_K, training
 from thermostand.compensation.drift_runtime import SETTLED_TAUS, Follower, compiled
-from thermostand.compensation.history.states import Float
+from thermostand.compensation.history.thermal_history import Float
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError

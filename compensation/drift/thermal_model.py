@@ -27,7 +27,7 @@ from thermostand.compensation.drift.drift_model import (
 from thermostand.compensation.drift.terms import TERMS, Term, features, memory_of, motions
 from thermostand.compensation.drift_runtime import SETTLED_TAUS, remembered
 from thermostand.compensation.expression import Origin
-from thermostand.compensation.history.states import Float, States, ThermalMemory
+from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory
 
 _LEAST_PX, _OF_DISCREPANCY = 0.002, 0.8
 """What a night leaves at set-points that were left out it leaves again, otherwise, on another one; and a little in any

@@ -11,8 +11,7 @@ from thermostand.compensation.drift.candidates import between
 from thermostand.compensation.drift.displacements import Displacements, anchors, displacements
 from thermostand.compensation.drift.terms import MOTIONS, ConstantTerm, Term, features, motions
 from thermostand.compensation.expression import Origin
-from thermostand.compensation.history.states import Float, States, ThermalMemory
-from thermostand.compensation.history.thermal_history import states_at
+from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory, states_at
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
@@ -199,7 +198,16 @@ def training(observations: Observations, terms: tuple[Term, ...], memory: Therma
     anchored = np.unique(observations.session[against & frames])
     rows = displacements(observations, frames & np.isin(observations.session, anchored), against)
     rows = rows.where(_same_place(rows)[rows.frame])
-    return Training(observations, rows, frames, terms, origin, states, relative, first)
+    return Training(
+        observations=observations,
+        rows=rows,
+        frames=frames,
+        terms=terms,
+        origin=origin,
+        states=states,
+        features=relative,
+        reference_features=first,
+    )
 
 
 def _trusted(observations: Observations, states: States, against: Mask) -> Mask:

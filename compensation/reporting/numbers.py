@@ -18,8 +18,7 @@ import numpy as np
 from thermostand.compensation.budget.budget import Budget
 from thermostand.compensation.calibration.session_centres import visits_for
 from thermostand.compensation.datasheet.details import Details
-from thermostand.compensation.drift.bump import Bump
-from thermostand.compensation.drift.bumps import around_bumps, find_bumps
+from thermostand.compensation.drift.bumps import Unrepeated, around_bumps, find_bumps, find_unrepeated
 from thermostand.compensation.drift.candidates import Candidate, pair_of, rms_px
 from thermostand.compensation.drift.displacements import displacements
 from thermostand.compensation.drift.drift_model import DriftModel
@@ -30,11 +29,11 @@ from thermostand.compensation.drift.evaluation import (
     TemperatureRms,
     improvement_percent,
 )
+from thermostand.compensation.drift.facts import Bump
 from thermostand.compensation.drift.hysteresis import Hysteresis, hysteresis
 from thermostand.compensation.drift.paper_model import PaperModel, exponents
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states
-from thermostand.compensation.drift.unrepeated import Unrepeated, find_unrepeated
 from thermostand.compensation.expression import SPAN_K
 from thermostand.compensation.observations import Float, Mask, Observations
 from thermostand.compensation.reporting.equipment import Line, stated
@@ -131,7 +130,7 @@ class ScoreNumbers:
 @dataclass(frozen=True, slots=True)
 class BumpNumbers:
     """A step of the image that no thermal state explains, between the frames at `after` and `before`, the same as the
-    session's own instants after_ns and before_ns. motions_px, sigma_px (4,): as in compensation/drift/bump.py. marker:
+    session's own instants after_ns and before_ns. motions_px, sigma_px (4,): as in compensation/drift/facts.py. marker:
     the one that moved alone, from 0."""
 
     session_id: str
@@ -262,10 +261,8 @@ def _bumps(observations: Observations, bumps: Sequence[Bump]) -> Iterator[BumpNu
     utc = {facts.session_id: facts.utc for facts in observations.sessions}
     for bump in bumps:
         if bump.session_id in utc:
-            at_ns = bump.after_ns, bump.before_ns
-            at = [_instant(utc[bump.session_id].utc_ns(ns)) for ns in at_ns]
-            moved = bump.motions_px, bump.sigma_px
-            yield BumpNumbers(bump.session_id, at[0], at[1], *at_ns, *moved, bump.marker, bump.text)
+            after, before = (_instant(utc[bump.session_id].utc_ns(ns)) for ns in (bump.after_ns, bump.before_ns))
+            yield BumpNumbers(**bump.model_dump(), after=after, before=before, text=bump.text)
 
 
 def _session(observations: Observations, index: int) -> SessionNumbers:

@@ -17,11 +17,10 @@ from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.model_file import save_model
 from thermostand.compensation.observations import Observations, Progress, observe
 from thermostand.compensation.reporting.drawing import report_figures as figures
-from thermostand.compensation.reporting.drawing.drawing import Draw, one_by_one
+from thermostand.compensation.reporting.drawing.figures import Draw, one_by_one
 from thermostand.compensation.reporting.equipment import equipment_of
 from thermostand.compensation.reporting.numbers import Extras, Numbers, as_json, numbers_of, table_positions
-from thermostand.compensation.reporting.page import NamedFigure, orientation, page
-from thermostand.compensation.reporting.pages import validation_figures
+from thermostand.compensation.reporting.pages import NamedFigure, orientation, page, validation_figures
 from thermostand.compensation.reporting.tracks import Track, cycle, moved_px, visits, warm_ups
 from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.experiments.steps import Role

@@ -17,8 +17,8 @@ from typing import Any, cast, get_type_hints
 from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from thermostand.experiments.sequence import MOST_STEPS
 from thermostand.experiments.steps import Step
+from thermostand.experiments.written import MOST_STEPS
 from thermostand.foundation.document_faults import words
 
 GROUP = "thermostand.experiments"

@@ -9,12 +9,11 @@ from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, PrivateAttr, 
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from thermostand.experiments.calibration import CalibrationGrid, calibration
-from thermostand.experiments.sequence import checked
 from thermostand.experiments.steps import PlannedStep, Situation, Step, number_steps
 from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
 from thermostand.experiments.validation import Validation, validation
 from thermostand.experiments.warm_up import WarmUp, warm_up
-from thermostand.experiments.written import Place, PlanError, StepEntries, Written, unknown, written_steps
+from thermostand.experiments.written import Place, PlanError, StepEntries, Written, checked, unknown, written_steps
 from thermostand.foundation.documents import Document
 from thermostand.stand.config.added_experiments import added_names, added_steps, package_of
 

@@ -6,9 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from thermostand.drivers.wires.bus import Bus
-from thermostand.experiments.sequence import faults
 from thermostand.experiments.steps import PlannedStep
-from thermostand.experiments.written import Written
+from thermostand.experiments.written import Written, faults
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import parse_document, read_document
 from thermostand.foundation.errors import ConfigError

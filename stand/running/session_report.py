@@ -49,7 +49,7 @@ def report_session(session: Path, folder: Path) -> Reported:
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
     from thermostand.compensation.drift.evaluation import table
-    from thermostand.compensation.one_equilibrium import TwoEquilibria
+    from thermostand.compensation.observations import TwoEquilibria
     from thermostand.compensation.reporting.report import NoModel, analyse
 
     model, report = folder / MODEL_NAME, folder / REPORT_NAME

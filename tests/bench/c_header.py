@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.bench.figures import Figure, absolute, at_most, progress, side_by_side, skipped
 from tests.compensation.compiled_header import COMPILER
 from tests.compensation.made_up_models import paper, thermal
-from thermostand.compensation.apply.c_header import export_c
+from thermostand.compensation.apply.runtime_export import export_c
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.drift.thermal_model import ThermalModel
 

@@ -18,9 +18,8 @@ from tests.bench.figures import Figure, at_most, in_turns, milliseconds, progres
 from tests.compensation.calibration_cases import CENTRE_mm, board, positions, translation_errors_um
 from tests.compensation.calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw
 from thermostand.compensation.calibration.adjustment import Adjustment, adjust, table_from_poses
-from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.centre_corrections import shifts_by_homography
-from thermostand.compensation.calibration.model_scores import halves, rays_of
+from thermostand.compensation.calibration.board import Board, shifts_by_homography
+from thermostand.compensation.calibration.calibrate import halves, rays_of
 from thermostand.compensation.calibration.pinhole import OpencvCalibration, calibrate_opencv
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableGeometry, TableSigma

@@ -34,8 +34,8 @@ from tests.compensation.drawn_nights import (
 )
 from thermostand.compensation.design.next_visit import Wanted, decide
 from thermostand.compensation.drift.choosing import fit
-from thermostand.experiments.known import Enough, Frames, Visit, after_decision, first_decision, fixed_visits
-from thermostand.experiments.parameters import Known
+from thermostand.experiments.known import Enough, Visit, after_decision, first_decision, fixed_visits
+from thermostand.experiments.parameters import CaptureParameters, Known
 from thermostand.experiments.steps import Capture, Decide, SetTemperature, Soak, Step, usual_s
 from thermostand.foundation.errors import SessionError
 
@@ -108,7 +108,7 @@ def outcome_of(seed: int) -> Outcome:
     wanted = decide(same.observed, Wanted(_RANGE_DEGC, 1e-9, HELD_OUT_DEGC)).predicted_px
     fixed = _left(same, asked)
     gone_s, as_good_s, made = deciding_night(camera, seed, wanted, asked["at_rest"], fixed["at_rest"].rms_mpx)
-    whole_s = first_decision(Known(), WAY_DEGC, HELD_OUT_DEGC, DWELL_S, Frames(5, 0.5, 0.1)).left_s
+    whole_s = first_decision(Known(), WAY_DEGC, HELD_OUT_DEGC, DWELL_S, 5, CaptureParameters()).left_s
     return Outcome(100 * gone_s / whole_s, 100 * as_good_s / whole_s, fixed, _left(made, asked))
 
 
@@ -135,7 +135,7 @@ def deciding_night(
 ) -> tuple[float, float, Night]:
     """How long the cycle took, s, when it was as good as the fixed one, s, and the night."""
     known = Known(residual_px=residual_px)
-    steps: list[Step] = [first_decision(known, WAY_DEGC, HELD_OUT_DEGC, DWELL_S, Frames(5, 0.5, 0.1))]
+    steps: list[Step] = [first_decision(known, WAY_DEGC, HELD_OUT_DEGC, DWELL_S, 5, CaptureParameters())]
     parts, gone_s, as_good_s, degC, dwell_s = [*warm_up(), *reference()], 0.0, np.inf, 24.0, 0.0
     begin = len(parts)
     steps += fixed_visits(steps[0]) if isinstance(steps[0], Decide) else ()

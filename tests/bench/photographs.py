@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.bench.figures import Figure, absolute, progress, ratio_at_most, side_by_side, skipped
-from thermostand.markers.band import NARROW_SIGMA, WIDE_SIGMA
-from thermostand.markers.detection import Detection, Image, detect
+from thermostand.markers.detection import NARROW_SIGMA, WIDE_SIGMA, Detection, Image, detect
 from thermostand.markers.image_file import read_image
 from thermostand.markers.target import Target, load_target
 from thermostand.stand.config.stand_config import packaged

@@ -15,7 +15,7 @@ from thermostand.compensation.drift.displacements import displacements
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.expression import AIR
-from thermostand.compensation.history.states import States
+from thermostand.compensation.history.thermal_history import States
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 

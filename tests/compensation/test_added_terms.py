@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.apply.c_header import export_c
-from thermostand.compensation.apply.runtime_export import export
-from thermostand.compensation.design.forecast import after, at_rest, now, surroundings
-from thermostand.compensation.design.next_visit import Wanted, decide
+from thermostand.compensation.apply.runtime_export import export, export_c
+from thermostand.compensation.design.next_visit import Wanted, after, at_rest, decide, now, surroundings
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.terms import TERMS
 from thermostand.compensation.drift.thermal_learning import fit_thermal
@@ -19,7 +17,7 @@ from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift_runtime import Drift
 from thermostand.compensation.drift_runtime import compiled as worked_out
 from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, in_c, in_words, lag, play
-from thermostand.compensation.history.states import States, row_of, state_of
+from thermostand.compensation.history.thermal_history import States, row_of, state_of
 from thermostand.compensation.reporting.numbers import formula_of
 from thermostand.foundation.errors import ConfigError, SessionError
 

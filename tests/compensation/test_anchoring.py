@@ -10,7 +10,7 @@ import pytest
 
 from thermostand.compensation.drift.anchoring import anchored
 from thermostand.compensation.drift.model_file import load_model, save_model
-from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import fit_paper
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states

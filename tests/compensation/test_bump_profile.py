@@ -13,8 +13,8 @@ import pytest
 from tests.compensation import plant_night
 from tests.compensation.drawn_cameras import REPEATING, drawn_camera
 from tests.compensation.drawn_nights import followed_cycle, full_night, night, reference, warm_up
-from thermostand.compensation.drift.bump import Bump
 from thermostand.compensation.drift.bumps import find_bumps
+from thermostand.compensation.drift.facts import Bump
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 from tests.nightly import by_night
-from thermostand.compensation.apply.c_header import export_c, header_text
 from thermostand.compensation.apply.compensate_images import warp
-from thermostand.compensation.apply.runtime_export import runtime_model
+from thermostand.compensation.apply.runtime_export import export_c, header_text, runtime_model
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift_runtime import AMBIENT, CAMERA, HISTORY, STATE, SWITCHED_ON, Drift

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.calibration.adjustment import Adjustment, adjust
-from thermostand.compensation.calibration.calibrate import Model, calibrate
+from thermostand.compensation.calibration.calibrate import BROWN, Model, best, calibrate, halves, rays_of
 from thermostand.compensation.calibration.camera_file import camera_file
-from thermostand.compensation.calibration.model_scores import BROWN, best, halves, rays_of
 from thermostand.compensation.calibration.pinhole import calibrate_opencv
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.stage_geometry import TableSigma

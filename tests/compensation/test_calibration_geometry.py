@@ -6,10 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from thermostand.compensation.calibration.adjustment import table_from_poses
-from thermostand.compensation.calibration.board import Board
-from thermostand.compensation.calibration.bundle import Problem, TableScene, problem_of
-from thermostand.compensation.calibration.centre_corrections import shifts_by_camera, shifts_by_homography
+from thermostand.compensation.calibration.adjustment import Problem, TableScene, problem_of, table_from_poses
+from thermostand.compensation.calibration.board import Board, shifts_by_camera, shifts_by_homography
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise
 from thermostand.compensation.calibration.pinhole import Pinhole, across
 from thermostand.compensation.calibration.pose import find_pose
@@ -124,7 +122,9 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
     known = board(laboratory)
     scene = TableScene(RATIONAL, table, errors, known.points_mm)
     sigma = TableSigma(0.0005, 0.1, 0.001, 0.2)
-    problem = problem_of(seen, np.zeros_like(seen.centres_px), seen.seen, known, sigma, 0.0, RATIONAL)
+    problem = problem_of(
+        seen, known, sigma, lens=RATIONAL, shifts_px=np.zeros_like(seen.centres_px), used=seen.seen, discrepancy_px=0.0
+    )
     jacobian, residuals = written_out(problem, scene), problem.residuals(scene)
     assert len(jacobian) == len(residuals) == problem.count
     normal, gradient = problem.equations(scene, residuals)

@@ -7,7 +7,7 @@ import yaml
 
 from thermostand.compensation.calibration.adjustment import adjust
 from thermostand.compensation.calibration.board import board_of
-from thermostand.compensation.calibration.model_scores import rays_of
+from thermostand.compensation.calibration.calibrate import rays_of
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 from tests.nightly import by_night
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import ConfigError, DetectionError
-from thermostand.markers.april_grid import AprilGrid
-from thermostand.markers.corner_board import BoardOfCorners, CornerBoard, find_corners, load_corner_board
+from thermostand.markers.corner_board import AprilGrid, BoardOfCorners, CornerBoard, find_corners, load_corner_board
 
 SIZE = (1224, 1024)
 MATRIX = np.array([[2000.0, 0, 611.5], [0, 2000.0, 511.5], [0, 0, 1]])

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.nightly import by_night
-from thermostand.markers.band import NARROW_SIGMA, WIDE_SIGMA
-from thermostand.markers.detection import Detection, detect
+from thermostand.markers.detection import NARROW_SIGMA, WIDE_SIGMA, Detection, detect
 from thermostand.markers.sandwich import variance_growth, variance_ratio
 
 from .rendered import Float, render, true_centres_px

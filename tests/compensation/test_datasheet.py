@@ -13,12 +13,22 @@ import pytest
 from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app
-from thermostand.compensation.datasheet.datasheet import Datasheet, datasheet, frame_noise, warming_quantities
+from thermostand.compensation.datasheet.datasheet import (
+    NIGHTS,
+    Contribution,
+    Datasheet,
+    MeasuredQuantity,
+    Visits,
+    Warming,
+    datasheet,
+    frame_noise,
+    motions,
+    pooled,
+    warming_quantities,
+)
 from thermostand.compensation.datasheet.details import Details, load_details
-from thermostand.compensation.datasheet.motions import Visits, Warming, motions
-from thermostand.compensation.datasheet.quantity import NIGHTS, Contribution, MeasuredQuantity, direct, pooled
 from thermostand.compensation.drift.choosing import fit
-from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import fit_paper
 from thermostand.compensation.observations import Observations
 from thermostand.compensation.reporting.numbers import compact, measured, percent, significant
 from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page
@@ -113,8 +123,8 @@ def test_the_air_s_uncertainty_counts_in_what_depends_on_it():
 
 
 def test_several_nights_are_pooled_and_their_difference_is_a_contribution():
-    lines = (direct("noise", "A", 0.3, "px", ""), Contribution("air", "B", 0.1, "K", 2.0, ""))
-    one = MeasuredQuantity("k", "g", "n", "px", 1.0, "m", lines)
+    lines = Contribution("noise", "A", 0.3, "px", ""), Contribution("air", "B", 0.1, "K", "", 2.0)
+    one = MeasuredQuantity("k", "g", "n", "px", "m").found(1.0, *lines)
     both = pooled([one, replace(one, value=1.2)])
     assert both.value == pytest.approx(1.1)
     a, b, nights = both.contributions

@@ -5,18 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermostand.compensation.design.forecast import (
+from thermostand.compensation.design.next_visit import (
     CameraSurroundings,
+    Decision,
+    DesignState,
     ForecastState,
+    Wanted,
     after,
     at_rest,
+    best_course,
+    decide,
     now,
     surroundings,
+    wanted_states,
 )
-from thermostand.compensation.design.next_visit import Decision, DesignState, Wanted, best_course, decide, wanted_states
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.expression import AIR, CAMERA, lag, play
-from thermostand.compensation.history.states import Float, ThermalMemory
+from thermostand.compensation.history.thermal_history import Float, ThermalMemory
 from thermostand.compensation.observations import Observations
 
 from .drawn_cameras import drawn_camera

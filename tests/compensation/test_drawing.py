@@ -2,8 +2,7 @@
 
 import multiprocessing
 
-from thermostand.compensation.reporting.drawing.drawing import drawing, one_by_one
-from thermostand.compensation.reporting.drawing.figures import new_figure
+from thermostand.compensation.reporting.drawing.figures import drawing, new_figure, one_by_one
 
 
 def test_two_processes_draw_the_same_bytes():

@@ -13,9 +13,16 @@ from thermostand.compensation.drift.displacements import displacements
 from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.hull import convex_hull
 from thermostand.compensation.drift.model_file import load_model, save_model
-from thermostand.compensation.drift.paper_fit import choose, fit_paper
-from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, condense, design, solve
-from thermostand.compensation.history.states import States
+from thermostand.compensation.drift.paper_model import (
+    DegreeScore,
+    PaperModel,
+    choose,
+    condense,
+    design,
+    fit_paper,
+    solve,
+)
+from thermostand.compensation.history.thermal_history import States
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import ConfigError, SessionError

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.drift.evaluation import evaluate, improvement_percent, table
-from thermostand.compensation.drift.paper_fit import fit_paper
-from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.observations import Observations
 from thermostand.foundation.errors import SessionError
 

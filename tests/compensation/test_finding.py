@@ -17,8 +17,7 @@ import numpy as np
 import psutil
 import pytest
 
-from thermostand.compensation.finding.cache import keep, kept
-from thermostand.compensation.finding.finder import Finder, finder
+from thermostand.compensation.finding.finder import Finder, finder, keep, kept
 from thermostand.compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
 from thermostand.compensation.finding.workers import find_to_file, in_processes, in_turn, on_cluster
 from thermostand.compensation.observations import session_target

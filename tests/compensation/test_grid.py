@@ -10,8 +10,7 @@ import pytest
 
 from tests.nightly import by_night
 from thermostand.markers.bootstrap import Candidates
-from thermostand.markers.grid import DetectionError, Identified, identify, roll_deg
-from thermostand.markers.placement import placements
+from thermostand.markers.grid import DetectionError, Identified, identify, placements, roll_deg
 from thermostand.markers.target import OddMarker, Target, load_target
 
 from .rendered import Float, Scene, true_centres_px

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.drift.hysteresis import hysteresis
-from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import fit_paper
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.observations import Observations
 

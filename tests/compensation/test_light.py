@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from thermostand.markers.detection import under_common_light
 from thermostand.markers.edge_fit import EdgeFit, fit_edges
-from thermostand.markers.light import under_common_light
 from thermostand.markers.noise import Noise
 from thermostand.markers.pixels import picture_of
 

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from tests.recording.recorded import START_NS, frame, record
 from thermostand.compensation.cli import app
-from thermostand.compensation.one_equilibrium import check_one_equilibrium
+from thermostand.compensation.observations import check_one_equilibrium
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event, StepMark, StepState

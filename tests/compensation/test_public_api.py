@@ -21,8 +21,7 @@ import thermostand
 from thermostand import compensation, markers, recording
 from thermostand.compensation.drift.training import frame_states
 from thermostand.compensation.expression import POWER, lag
-from thermostand.compensation.history.states import ThermalMemory
-from thermostand.compensation.history.thermal_history import ThermalHistory, states_at
+from thermostand.compensation.history.thermal_history import ThermalHistory, ThermalMemory, states_at
 from thermostand.experiments.steps import Role
 
 from .conftest import Recorded

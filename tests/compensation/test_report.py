@@ -15,10 +15,9 @@ import pytest
 from thermostand.compensation.budget.budget import Budget, BudgetLine
 from thermostand.compensation.budget.geometry import StandState
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
-from thermostand.compensation.drift.paper_fit import fit_paper
-from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.drift.terms import features
-from thermostand.compensation.history.states import States
+from thermostand.compensation.history.thermal_history import States
 from thermostand.compensation.observations import Observations
 from thermostand.compensation.reporting.drawing.figures import enlarged
 from thermostand.compensation.reporting.drawing.report_figures import measured_against_model
@@ -40,8 +39,8 @@ BUDGET = Budget(
     reference=StandState(24.01, 24.02, 24.03, 24.04, 24.05),
     air_degC=(10.5, 51.5),
     contributions=(
-        BudgetLine("granite along the axis", 25.17, 4.05, -0.04861, 0.00782, "the frame's corner", True),
-        BudgetLine("linear table, resolution", 0.31, float("nan"), 0.00047, float("nan"), "outermost", False),
+        BudgetLine("granite along the axis", 25.17, -0.04861, "the frame's corner", 4.05, 0.00782, True),
+        BudgetLine("linear table, resolution", 0.31, 0.00047, "outermost"),
     ),
 )
 HEADINGS = (

@@ -12,9 +12,8 @@ import pytest
 
 from thermostand.compensation.reporting.numbers import Extras, TablePositions, numbers_of, table_positions
 from thermostand.compensation.reporting.report import report_page
-from thermostand.compensation.validation3d.deviations import Deviations
 from thermostand.compensation.validation3d.document import as_json, load_validation
-from thermostand.compensation.validation3d.validate import SpatialValidation
+from thermostand.compensation.validation3d.validate import Deviations, SpatialValidation
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark, StepState
 

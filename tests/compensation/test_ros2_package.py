@@ -16,8 +16,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from thermostand.compensation.apply.ros2_package import export_ros2
-from thermostand.compensation.apply.runtime_export import runtime_model
+from thermostand.compensation.apply.runtime_export import export_ros2, runtime_model
 from thermostand.compensation.drift_runtime import Drift
 
 from .made_up_models import thermal

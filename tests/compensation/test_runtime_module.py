@@ -14,7 +14,7 @@ from thermostand.compensation.apply.runtime_export import export, runtime_model
 from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift_runtime import Drift
-from thermostand.compensation.history.states import States, row_of, state_of
+from thermostand.compensation.history.thermal_history import States, row_of, state_of
 from thermostand.foundation.errors import SessionError
 
 from .made_up_models import LIFE, MODELS, POINTS, paper, thermal

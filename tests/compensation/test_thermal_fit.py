@@ -14,14 +14,12 @@ from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.evaluation import evaluate
 from thermostand.compensation.drift.facts import ModelFacts
 from thermostand.compensation.drift.model_file import load_model, save_model
-from thermostand.compensation.drift.paper_fit import fit_paper
-from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.drift.terms import OfPlay
 from thermostand.compensation.drift.thermal_learning import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training import frame_states
-from thermostand.compensation.history.states import States, row_of, state_of
-from thermostand.compensation.history.thermal_history import states_at
+from thermostand.compensation.history.thermal_history import States, row_of, state_of, states_at
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import ConfigError, SessionError

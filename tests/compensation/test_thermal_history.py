@@ -10,8 +10,15 @@ import pytest
 
 from thermostand.compensation.drift_runtime import ThermalState
 from thermostand.compensation.expression import AIR, CAMERA, POWER, lag, play
-from thermostand.compensation.history.states import States, ThermalMemory, row_of, state_of
-from thermostand.compensation.history.thermal_history import ThermalHistory, refined, states_at
+from thermostand.compensation.history.thermal_history import (
+    States,
+    ThermalHistory,
+    ThermalMemory,
+    refined,
+    row_of,
+    state_of,
+    states_at,
+)
 
 S = 1_000_000_000
 TAUS_S = (600.0, 3600.0)

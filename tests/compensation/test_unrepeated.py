@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.drift.bumps import find_bumps
+from thermostand.compensation.drift.bumps import Cause, Unrepeated, find_bumps, find_unrepeated
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.evaluation import evaluate
-from thermostand.compensation.drift.unrepeated import Cause, Unrepeated, find_unrepeated
 from thermostand.compensation.reporting.report import write_report
 
 from .drawn_cameras import drawn_camera

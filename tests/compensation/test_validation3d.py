@@ -16,14 +16,22 @@ from thermostand.compensation.calibration.camera_file import CameraFile, camera_
 from thermostand.compensation.calibration.session_centres import mean_centres
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.compensation.drift.drift_model import Outside
-from thermostand.compensation.drift.paper_fit import fit_paper
-from thermostand.compensation.drift.paper_model import PaperModel
+from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.observations import Float
 from thermostand.compensation.reporting.pages import validation_page
-from thermostand.compensation.validation3d.deviations import CalibratedCamera, Deviations, Doubts, deviations, find
-from thermostand.compensation.validation3d.document import as_json, summary
-from thermostand.compensation.validation3d.paper import TABLE_1, AFTER_mm, BEFORE_mm
-from thermostand.compensation.validation3d.validate import LensModel, SpatialValidation, camera_of, check_same, validate
+from thermostand.compensation.validation3d.document import TABLE_1, AFTER_mm, BEFORE_mm, as_json, summary
+from thermostand.compensation.validation3d.validate import (
+    CalibratedCamera,
+    Deviations,
+    Doubts,
+    LensModel,
+    SpatialValidation,
+    camera_of,
+    check_same,
+    deviations,
+    find,
+    validate,
+)
 from thermostand.foundation.errors import CalibrationError, SessionError
 
 from .calibration_cases import board, positions, target_of

@@ -22,9 +22,9 @@ from thermostand.compensation.calibration.camera_file import camera_file
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.compensation.drift.model_file import save_model
-from thermostand.compensation.drift.paper_fit import fit_paper
+from thermostand.compensation.drift.paper_model import fit_paper
 from thermostand.compensation.observations import Float, Observations, observe_session, session_target
-from thermostand.compensation.validation3d.validation_frames import validation_frames
+from thermostand.compensation.validation3d.validate import validation_frames
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.documents import parse_document

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.observations import Observations
-from thermostand.compensation.validation3d.validation_frames import ValidationFrames
+from thermostand.compensation.validation3d.validate import ValidationFrames
 
 from .calibration_truth import SIZE, VALIDATION, Laboratory, Truth, ellipse_centres
 from .synthetic import CAMERA_ABOVE_CHAMBER_K, REFERENCE_DEGC, TARGET, facts

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from thermostand.compensation.one_equilibrium import TwoEquilibria
+from thermostand.compensation.observations import TwoEquilibria
 from thermostand.compensation.reporting import report
 from thermostand.stand.running.session_report import NotReported, report_session
 

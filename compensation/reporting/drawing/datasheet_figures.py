@@ -6,8 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thermostand.compensation.datasheet.datasheet import Datasheet
-from thermostand.compensation.datasheet.motions import UNITS, Visits, Warming
+from thermostand.compensation.datasheet.datasheet import UNITS, Datasheet, Visits, Warming
 from thermostand.compensation.reporting.drawing.figures import (
     FULL_WIDTH_IN,
     GREY,

@@ -7,9 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thermostand.compensation.reporting.drawing.figures import I_COLOUR, J_COLOUR, new_figure, style
-from thermostand.compensation.validation3d.deviations import Deviations
-from thermostand.compensation.validation3d.paper import AFTER_mm, BEFORE_mm
-from thermostand.compensation.validation3d.validate import SpatialValidation
+from thermostand.compensation.validation3d.document import AFTER_mm, BEFORE_mm
+from thermostand.compensation.validation3d.validate import Deviations, SpatialValidation
 
 AXES = ("X", "Y", "Z")
 _BEFORE, _AFTER = I_COLOUR, J_COLOUR
