@@ -9,26 +9,28 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.markers import edge_model, newton, pixels, sandwich, sectors
 from thermostand.markers.compiled import digest, entry
-from thermostand.markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, Variance
+from thermostand.markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, room_for_work
 from thermostand.markers.newton import (
     DIVERGED,
     LEAST_BAND_PX,
     SETTLED,
     TOO_FEW,
-    Work,
+    Setting,
+    Starts,
     inverse,
     mean_radius,
     no_belief,
     settle,
 )
 from thermostand.markers.noise import Noise
-from thermostand.markers.pixels import Picture, Pixels, empty_pixels
+from thermostand.markers.pixels import Picture, empty_pixels
 from thermostand.markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
 from thermostand.markers.sectors import misfits
 
@@ -95,25 +97,44 @@ def fit_edges(
     """
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
-    covariance, quality, scatter, flags = (
-        np.empty((count, PARAMETERS, PARAMETERS)),
-        np.empty((count, 3)),
-        np.empty((count, 2, 2)),
-        np.empty(count, np.uint8),
+    found = _Fitted(
+        covariance=np.empty((count, PARAMETERS, PARAMETERS)),
+        quality=np.empty((count, 3)),
+        scatter=np.empty((count, 2, 2)),
+        flags=np.empty(count, np.uint8),
     )
     # A copy of `reach`: read-only memory would be another type to the compiler.
-    _fit_all(
-        image, parameters, start.scale_px, np.array(reach, np.float64),
-        (noise.floor_DN2, noise.slope_DN), image.full_scale_DN - 1, empty_pixels(room(image, start, band_sigma)),
-        band_sigma, max(1, count // sampled),
-        covariance, quality, scatter, flags,
-    )  # fmt: skip
+    starts = Starts(parameters, start.scale_px, np.array(reach, np.float64))
+    _fit_all(setting_of(image, start, noise, band_sigma), starts, max(1, count // sampled), found)
+    chi, misfit, levels = found.quality.T
     return EdgeFit(
-        EdgeState(parameters, start.scale_px), covariance, quality[:, 0], quality[:, 1], quality[:, 2], scatter, flags
+        state=EdgeState(parameters, start.scale_px),
+        covariance=found.covariance,
+        chi=chi,
+        misfit=misfit,
+        levels=levels,
+        scatter=found.scatter,
+        flags=found.flags,
     )
 
 
-def room(image: Picture, start: EdgeState, band_sigma: float) -> int:
+class _Fitted(NamedTuple):
+    """What is found of N markers besides their parameters; quality (N, 3): chi and misfits."""
+
+    covariance: Float
+    quality: Float
+    scatter: Float
+    flags: NDArray[np.uint8]
+
+
+def setting_of(image: Picture, start: EdgeState, noise: Noise, band_sigma: float) -> Setting:
+    """For fits from `start`."""
+    pixels = empty_pixels(_room(image, start, band_sigma))
+    variance = noise.floor_DN2, noise.slope_DN
+    return Setting(image, variance, image.full_scale_DN - 1, band_sigma, pixels, room_for_work())
+
+
+def _room(image: Picture, start: EdgeState, band_sigma: float) -> int:
     """Pixels of the largest marker with its band, when it turns out half as large again and six times as blurred."""
     side = 3 * start.half_extents_px() + 12 * np.maximum(band_sigma * start.parameters[:, SIGMA, None], LEAST_BAND_PX)
     return int(min(np.nanmax(np.prod(side + 3, axis=1), initial=1), image.shape[0] * image.shape[1]))
@@ -121,41 +142,28 @@ def room(image: Picture, start: EdgeState, band_sigma: float) -> int:
 
 def _compiled_fit(sources: str) -> Callable[..., None]:
     @entry
-    def fit_all(
-        image: Picture,
-        parameters: Float,
-        scale: Float,
-        reach: Float,
-        noise: Variance,
-        ceiling: int,
-        pixels: Pixels,
-        band_sigma: float,
-        every: int,
-        covariance: Float,
-        quality: Float,
-        scatter: Float,
-        flags: NDArray[np.uint8],
-    ) -> None:
-        """Fit each row of `parameters` in place; chi and misfits into `quality` (N, 3)."""
+    def fit_all(setting: Setting, starts: Starts, every: int, found: _Fitted) -> None:
+        """Fit each row of the parameters in place. every: how many markers apart those are that are looked at for
+        `scatter`."""
         _ = sources
-        work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
-        belief = no_belief()
+        belief, pixels, noise = no_belief(), setting.pixels, setting.noise
+        covariance, quality, scatter, flags = found
         scatter[:] = math.nan
-        for n in range(len(scale)):
-            p = parameters[n].copy()
-            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
+        for n in range(len(starts.scale)):
+            p, scale = starts.parameters[n].copy(), starts.scale[n]
+            outcome = settle(setting, p, scale, starts.reach[n], belief)
             flags[n] = _BORDER * outcome.cut + _SATURATED * (outcome.burnt > _SATURATED_PART * outcome.seen)
             if outcome.status == SETTLED:
-                unscaled = inverse(work)
+                unscaled = inverse(setting.work)
                 for i in range(PARAMETERS):
-                    parameters[n, i] = p[i]
+                    starts.parameters[n, i] = p[i]
                     for j in range(PARAMETERS):
                         covariance[n, i, j] = unscaled[i, j] * outcome.variance
                 quality[n, 0] = math.sqrt(outcome.variance)
                 quality[n, 1], quality[n, 2] = misfits(pixels, p)
                 if n % every == 0:
-                    clusters = clusters_of(mean_radius(p, scale[n]))
-                    robust, independent = centre_scatter(pixels, p, scale[n], noise, unscaled, clusters)
+                    clusters = clusters_of(mean_radius(p, scale))
+                    robust, independent = centre_scatter(pixels, p, scale, noise, unscaled, clusters)
                     for axis in range(2):
                         scatter[n, 0, axis] = robust[axis]
                         scatter[n, 1, axis] = independent[axis] * outcome.variance

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,24 +80,36 @@ class EdgeState:
         return EdgeState(self.parameters[which], self.scale_px[which])
 
 
+class Work(NamedTuple):
+    """Room for one marker's J'WJ (12, 12) and J'We (12,)."""
+
+    normal: Float
+    right: Float
+
+
+def room_for_work() -> Work:
+    """Not filled yet."""
+    return Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
+
+
 @compiled
 def normal_equations(
-    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float, is_known: bool
+    pixels: Pixels, p: Float, scale: float, noise: Variance, work: Work, is_known: bool
 ) -> tuple[float, float]:
-    """Set J'WJ (12, 12), unless it is known well enough from parameters near by, and J'We (12,) at the parameters `p`,
-    write each pixel's residual, and return the sum of squared residuals and the sum of the pixels' shares."""
-    levels = np.zeros((PARAMETERS, PARAMETERS))
-    right[:] = 0
+    """Set J'WJ, unless it is known well enough from parameters near by, and J'We at the parameters `p`, write each
+    pixel's residual, and return the sum of squared residuals and the sum of the pixels' shares."""
+    normal, levels = work.normal, np.zeros((PARAMETERS, PARAMETERS))
+    work.right[:] = 0
     squares, weights = 0.0, 0.0
-    for region, first in ((GROUND, B0), (DISC, F0)):
-        more = _level_equations(pixels, region, p, scale, noise, levels, right, first)
+    for region in (GROUND, DISC):
+        more = _level_equations(pixels, region, p, scale, noise, Work(levels, work.right))
         squares += more[0]
         weights += more[1]
     if not is_known:
         for i in range(PARAMETERS):
             for j in range(PARAMETERS):
                 normal[i, j] = levels[i, j]
-    more = _core_equations(pixels, p, scale, noise, normal, right, is_known)
+    more = _core_equations(pixels, p, scale, noise, work, is_known)
     if not is_known:
         for i in range(PARAMETERS):
             for j in range(i):
@@ -106,9 +119,9 @@ def normal_equations(
 
 @compiled
 def _core_equations(
-    pixels: Pixels, p: Float, scale: float, noise: Variance, normal: Float, right: Float, is_known: bool
+    pixels: Pixels, p: Float, scale: float, noise: Variance, work: Work, is_known: bool
 ) -> tuple[float, float]:
-    """Add the pixels near the outline to the upper half of `normal`, unless that is known, and to `right`."""
+    """Add the pixels near the outline to the upper half of J'WJ, unless that is known, and to J'We."""
     rows = np.empty((ROWS, BLOCK), np.float32)
     block = rows.ravel()
     squares, weights = 0.0, 0.0
@@ -120,8 +133,8 @@ def _core_equations(
         _keep_residuals(block, size, pixels.table[CORE], first)
         for i in range(0, PARAMETERS, 3):
             for j in range(PARAMETERS if is_known else i, PARAMETERS, 3):
-                _add_products(rows, i, j, size, normal)
-            _add_right(rows, i, size, right)
+                _add_products(rows, i, j, size, work.normal)
+            _add_right(rows, i, size, work.right)
     return squares, weights
 
 
@@ -244,10 +257,11 @@ def _add_right(rows: Single, i: int, size: int, right: Float) -> None:
 
 @compiled
 def _level_equations(
-    pixels: Pixels, region: int, p: Float, scale: float, noise: Variance, normal: Float, right: Float, first: int
+    pixels: Pixels, region: int, p: Float, scale: float, noise: Variance, work: Work
 ) -> tuple[float, float]:
-    """Add the pixels of a region that sees only the plane whose parameters begin at `first`."""
-    table = pixels.table[region]
+    """Add the pixels of a region that sees only the plane of its level."""
+    table, normal, right = pixels.table[region], work.normal, work.right
+    first = B0 if region == GROUND else F0
     u, v, value, share, residual = table[U], table[V], table[VALUE], table[SHARE], table[RESIDUAL]
     cx, cy = np.float32(p[CX] - pixels.origin[0]), np.float32(p[CY] - pixels.origin[1])
     per_scale, floor, gain = np.float32(1 / scale), np.float32(noise[0]), np.float32(noise[1])

@@ -24,6 +24,7 @@ from thermostand.markers.edge_model import (
     SIGMA,
     Float,
     Variance,
+    Work,
     normal_equations,
 )
 from thermostand.markers.pixels import SHARE, VALUE, Gathered, Limits, Picture, Pixels, U, V, gather
@@ -65,11 +66,25 @@ class Outcome(NamedTuple):
     cut: bool
 
 
-class Work(NamedTuple):
-    """Room for one marker's J'WJ (12, 12) and J'We (12,)."""
+class Setting(NamedTuple):
+    """What all markers of an image are fitted with. ceiling: DN, from which on pixels are saturated. band_sigma: half
+    width of the band, blurs. pixels, work: room for one marker."""
 
-    normal: Float
-    right: Float
+    image: Picture
+    noise: Variance
+    ceiling: int
+    band_sigma: float
+    pixels: Pixels
+    work: Work
+
+
+class Starts(NamedTuple):
+    """N markers to be fitted: parameters (N, 12), set in place; scale (N,); reach (N, 2): from where to where their
+    pixels may lie, in radii."""
+
+    parameters: Float
+    scale: Float
+    reach: Float
 
 
 class Belief(NamedTuple):
@@ -88,30 +103,20 @@ def no_belief() -> Belief:
 
 
 @compiled
-def settle(
-    image: Picture,
-    p: Float,
-    scale: float,
-    reach: Float,
-    noise: Variance,
-    ceiling: int,
-    pixels: Pixels,
-    work: Work,
-    belief: Belief,
-    band_sigma: float,
-) -> Outcome:
+def settle(setting: Setting, p: Float, scale: float, reach: Float, belief: Belief) -> Outcome:
     """Fit `p` (12,) to the image in place. The pixels are gathered again when the outline has left them or turned out
     more blurred than it was thought to be, which also makes the result independent of the start. reach (2,): from where
     to where its pixels may lie, in radii."""
     start, gathered_at = p.copy(), p.copy()
+    pixels, work, noise, band_sigma = setting.pixels, setting.work, setting.noise, setting.band_sigma
     far = math.isnan(p[B0])
-    gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
+    gathered = look(setting, p, scale, band(p, scale, reach, far, band_sigma), belief)
     gatherings, variance, is_near = 1, math.nan, False
     if far:
         set_start_levels(pixels, p, scale)
     fixed = mean_radius(p, scale) < _SLOPES_FROM_PX
     for _ in range(_STEPS):
-        variance, step = next_step(pixels, p, scale, noise, work, belief, fixed, is_near)
+        variance, step = next_step(setting, p, scale, belief, fixed, is_near)
         if math.isnan(variance):
             return Outcome(TOO_FEW, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         for i in range(PARAMETERS):
@@ -125,7 +130,7 @@ def settle(
         if is_near:
             sharpen(work, (p[SIGMA] - step[SIGMA]) / p[SIGMA])
         if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale, band_sigma):
-            gathered = look(image, p, scale, band(p, scale, reach, far, band_sigma), ceiling, pixels, belief)
+            gathered = look(setting, p, scale, band(p, scale, reach, far, band_sigma), belief)
             gathered_at = p.copy()
             gatherings += 1
             is_near = False
@@ -140,12 +145,12 @@ def settle(
 
 @compiled
 def next_step(
-    pixels: Pixels, p: Float, scale: float, noise: Variance, work: Work, belief: Belief, fixed: bool, is_near: bool
+    setting: Setting, p: Float, scale: float, belief: Belief, fixed: bool, is_near: bool
 ) -> tuple[float, Float]:
     """The variance of a pixel about the model, NaN when there are too few for it, and the step (12,) from `p`. fixed:
     the levels have no slopes. is_near: J'WJ is that of the step before."""
-    free = PARAMETERS - 4 * fixed
-    squares, weights = normal_equations(pixels, p, scale, noise, work.normal, work.right, is_near)
+    free, work = PARAMETERS - 4 * fixed, setting.work
+    squares, weights = normal_equations(setting.pixels, p, scale, setting.noise, work, is_near)
     if weights < _PIXELS_PER_PARAMETER * free:
         return math.nan, p
     add_belief(work, p, belief, is_near)
@@ -164,13 +169,11 @@ def is_short(length_px: float, gain: float, is_near: bool) -> bool:
 
 
 @compiled
-def look(
-    image: Picture, p: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels, belief: Belief
-) -> Gathered:
+def look(setting: Setting, p: Float, scale: float, limits: Limits, belief: Belief) -> Gathered:
     """Gather the pixels round the outline of `p`, without those of sectors that are not kept."""
-    gathered = gather(image, p[:2], p[M11:SIGMA], scale, limits, ceiling, pixels)
+    gathered = gather(setting.image, p[:SIGMA], scale, limits, setting.ceiling, setting.pixels)
     if number_of(belief.kept) < SECTORS:
-        set_aside(pixels, p, belief.kept)
+        set_aside(setting.pixels, p, belief.kept)
     return gathered
 
 

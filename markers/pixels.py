@@ -62,6 +62,17 @@ class Gathered(NamedTuple):
     cut: bool
 
 
+class Run(NamedTuple):
+    """Pixels of a row that follow each other. first: byte of the image where they begin, of `size` each. x, y: place of
+    the first one, from the origin."""
+
+    first: int
+    size: int
+    length: int
+    x: int
+    y: int
+
+
 class Picture(NamedTuple):
     """A grey image as the fit sees it. samples: (height, width, 1 or 2 bytes of a pixel, the low one first).
     full_scale_DN: the largest value a pixel can have. rows: (height,), those that are there. missed: (1,), set when
@@ -102,15 +113,14 @@ def empty_pixels(capacity: int) -> Pixels:
 
 
 @compiled
-def gather(
-    image: Picture, centre: Float, shape: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels
-) -> Gathered:
-    """Fill `pixels` from the image, row by row, with those whose F lies in `limits`; `shape` is m11, m12, m22.
+def gather(image: Picture, ellipse: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels) -> Gathered:
+    """Fill `pixels` from the image, row by row, with those whose F lies in `limits`; `ellipse` (5,) is cx, cy, m11,
+    m12, m22.
 
     Saturated ones get the share 0 (glare), unless they are a quarter of the ground or of the disc: then the picture
     is overexposed, and clipping shifts the outline but not the centre.
     """
-    samples, rows, missed = image.samples, image.rows, image.missed
+    samples, rows, missed, centre, shape = image.samples, image.rows, image.missed, ellipse[:2], ellipse[2:5]
     height, width, size = samples.shape
     room, table = pixels.table.shape[2], pixels.table.reshape(pixels.table.size)
     count = pixels.counts
@@ -137,7 +147,7 @@ def gather(
             seen += end - begin
             first, slot = (row * width + begin) * size, region * _ROWS * room + count[region]
             x, y = begin - pixels.origin[0], row - pixels.origin[1]
-            _copy_run(flat, first, size, end - begin, x, y, table, slot, room)
+            _copy_run(flat, Run(first, size, end - begin, x, y), table, slot, room)
             count[region] += end - begin
     burnt = 0
     for region in range(3):
@@ -161,18 +171,16 @@ def _set_ends(ends: Columns, cx: float, shape: Float, scale: float, y: float, li
 
 
 @compiled
-def _copy_run(
-    flat: Bytes, first: int, size: int, length: int, x: float, y: float, table: Single, slot: int, room: int
-) -> None:
-    """Write `length` pixels of a row, whose first byte is `first` of `flat`, into the table from `slot` on, and up to 7
-    more behind them.
+def _copy_run(flat: Bytes, run: Run, table: Single, slot: int, room: int) -> None:
+    """Write the pixels of a run of the image's bytes into the table from `slot` on, and up to 7 more behind them.
 
     Both are one long row: slices of tables would be counted as in use, and released, for every run.
     """
-    whole = (length + _AT_ONCE - 1) // _AT_ONCE * _AT_ONCE
+    first, size = run.first, run.size
+    whole = (run.length + _AT_ONCE - 1) // _AT_ONCE * _AT_ONCE
     count = np.uint64(min(whole, (len(flat) - first) // size))  # unsigned: not looked at for being negative
     u, v, values = np.uint64(slot + U * room), np.uint64(slot + V * room), np.uint64(slot + VALUE * room)
-    byte, column, row = np.uint64(first), np.float32(x), np.float32(y)
+    byte, column, row = np.uint64(first), np.float32(run.x), np.float32(run.y)
     for k in range(count):
         table[u + k] = column + np.float32(np.int32(k))
     for k in range(count):

@@ -16,11 +16,11 @@ import numpy as np
 
 from thermostand.markers import edge_model, newton, pixels, sectors
 from thermostand.markers.compiled import compiled, digest, entry
-from thermostand.markers.edge_fit import room
-from thermostand.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, Variance, normal_equations
-from thermostand.markers.newton import SETTLED, Belief, Work, band, inverse, look, settle
+from thermostand.markers.edge_fit import setting_of
+from thermostand.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, normal_equations
+from thermostand.markers.newton import SETTLED, Belief, Setting, Starts, band, inverse, look, settle
 from thermostand.markers.noise import Noise
-from thermostand.markers.pixels import Picture, Pixels, empty_pixels
+from thermostand.markers.pixels import Picture
 from thermostand.markers.sectors import SECTORS, Bools, all_kept, number_of, sector_misfits
 
 _LEAST_SECTORS = 13
@@ -52,11 +52,9 @@ def refit_edges(
     parameters = np.ascontiguousarray(start.parameters).copy()
     covariance, chi = np.empty((count, 2, 2)), np.empty(count)
     # A copy of `reach`: read-only memory would be another type to the compiler.
-    _refit_all(
-        image, parameters, start.scale_px, np.array(reach, np.float64), 1 / spread**2,
-        (noise.floor_DN2, noise.slope_DN), image.full_scale_DN - 1, empty_pixels(room(image, start, band_sigma)),
-        _GREATEST_MISFIT * max(patience, 1.0), band_sigma, covariance, chi,
-    )  # fmt: skip
+    starts = Starts(parameters, start.scale_px, np.array(reach, np.float64))
+    setting = setting_of(image, start, noise, band_sigma)
+    _refit_all(setting, starts, 1 / spread**2, _GREATEST_MISFIT * max(patience, 1.0), covariance, chi)
     return Refit(EdgeState(parameters, start.scale_px), covariance, chi)
 
 
@@ -107,32 +105,22 @@ def drop_neighbours(kept: Bools) -> None:
 def _compiled_refit(sources: str) -> Callable[..., None]:
     @entry
     def refit_all(
-        image: Picture,
-        parameters: Float,
-        scale: Float,
-        reach: Float,
-        weight: Float,
-        noise: Variance,
-        ceiling: int,
-        pixels: Pixels,
-        greatest: float,
-        band_sigma: float,
-        covariance: Float,
-        chi: Float,
+        setting: Setting, starts: Starts, weight: Float, greatest: float, covariance: Float, chi: Float
     ) -> None:
-        """Fit each row of `parameters` in place."""
+        """Fit each row of the parameters in place. weight (N, 4): of what the other markers say. greatest: misfit of a
+        sector that is kept."""
         _ = sources
-        work = Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
-        for n in range(len(scale)):
-            p = parameters[n].copy()
+        pixels, work = setting.pixels, setting.work
+        for n in range(len(starts.scale)):
+            p, scale, reach = starts.parameters[n].copy(), starts.scale[n], starts.reach[n]
             covariance[n], chi[n] = math.nan, math.nan
             belief = Belief(all_kept(), p[M11 : SIGMA + 1].copy(), weight[n])
-            look(image, p, scale[n], band(p, scale[n], reach[n], False, band_sigma), ceiling, pixels, belief)
-            normal_equations(pixels, p, scale[n], noise, work.normal, work.right, False)
+            look(setting, p, scale, band(p, scale, reach, False, setting.band_sigma), belief)
+            normal_equations(pixels, p, scale, setting.noise, work, False)
             drop_strangers(belief.kept, sector_misfits(pixels, p), greatest)
             searching = True
             while searching and number_of(belief.kept) >= _LEAST_SECTORS:
-                outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
+                outcome = settle(setting, p, scale, reach, belief)
                 if outcome.status != SETTLED:
                     break
                 searching = drop_worst(belief.kept, sector_misfits(pixels, p), greatest)
@@ -142,11 +130,11 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
             drop_neighbours(belief.kept)
             if number_of(belief.kept) < _LEAST_SECTORS:
                 continue
-            outcome = settle(image, p, scale[n], reach[n], noise, ceiling, pixels, work, belief, band_sigma)
+            outcome = settle(setting, p, scale, reach, belief)
             if outcome.status == SETTLED:
                 unscaled = inverse(work)
                 for i in range(PARAMETERS):
-                    parameters[n, i] = p[i]
+                    starts.parameters[n, i] = p[i]
                 for i in range(2):
                     for j in range(2):
                         moved = (p[i] - before[i]) * (p[j] - before[j])

@@ -87,7 +87,7 @@ def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inve
                 derivatives(block, size, p, scale, noise)
                 _core_influences(rows, inverse, size, seen)
             else:
-                _level_influences(rows, p, noise, inverse, level, size, seen)
+                _level_influences(rows, p[level : level + 3], noise, inverse[:2, level : level + 3], size, seen)
             _add_block(seen, size, sums)
     variances = np.zeros((2, 2))
     for axis in range(2):
@@ -113,11 +113,9 @@ def _core_influences(rows: Single, inverse: Float, size: int, seen: Single) -> N
 
 
 @compiled
-def _level_influences(
-    rows: Single, p: Float, noise: Variance, inverse: Float, level: int, size: int, seen: Single
-) -> None:
-    """The same for pixels that see only the plane whose parameters begin at `level`."""
-    a, b, c = np.float32(p[level]), np.float32(p[level + 1]), np.float32(p[level + 2])
+def _level_influences(rows: Single, plane: Float, noise: Variance, influence: Float, size: int, seen: Single) -> None:
+    """The same for pixels that see only a plane, by its parameters (3,) and what they move cx and cy by (2, 3)."""
+    a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     floor, gain = np.float32(noise[0]), np.float32(noise[1])
     for k in range(size):
         model = a + b * seen[_X, k] + c * seen[_Y, k]
@@ -125,8 +123,7 @@ def _level_influences(
         seen[_E, k] = root * (rows[VALUES, k] - model)
         seen[_PLACE, k] = root
     for row, axis in ((_G, CX), (_H, CY)):
-        g = np.float32(inverse[axis, level])
-        gx, gy = np.float32(inverse[axis, level + 1]), np.float32(inverse[axis, level + 2])
+        g, gx, gy = np.float32(influence[axis, 0]), np.float32(influence[axis, 1]), np.float32(influence[axis, 2])
         for k in range(size):
             seen[row, k] = seen[_PLACE, k] * (g + gx * seen[_X, k] + gy * seen[_Y, k])
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numba as nb
@@ -112,6 +112,23 @@ def _of_source_rows(from_x: Float32, from_y: Float32) -> Float32:
     return from_x[above, columns] + part * (from_x[above + 1, columns] - from_x[above, columns])
 
 
+class _Cells(NamedTuple):
+    """Cells of BLOCK_px columns that follow each other; a strip is so many, whose offsets begin at that of `first`."""
+
+    first: int
+    count: int
+
+
+class _Room(NamedTuple):
+    """What a band of source rows is read with: whole pixels of the strip's cells, weights of its columns, a row of the
+    source, and the rows that are held."""
+
+    whole: Int64
+    weights: Float32
+    row: Float32
+    held: Float32
+
+
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, out: Float32) -> None:
     """Strip by strip; bands of source rows that were read along x are held until others need their place. from_x: of
@@ -119,17 +136,18 @@ def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, ou
     height, width = image.shape
     held = np.empty((_HELD_ROWS, _STRIP), np.float32)
     bands = np.empty(_HELD_BANDS, np.int64)
-    weights, weights_along = np.empty((2 * TAPS, _STRIP), np.float32), np.empty((2 * TAPS, _STRIP), np.float32)
-    whole, whole_along = np.empty(_STRIP // BLOCK_px, np.int64), np.empty(_STRIP // BLOCK_px, np.int64)
-    row, line = np.empty(2 * _STRIP, np.float32), np.empty(_STRIP, np.float32)
+    whole, weights = np.empty(_STRIP // BLOCK_px, np.int64), np.empty((2 * TAPS, _STRIP), np.float32)
+    along = _Room(np.empty_like(whole), np.empty_like(weights), np.empty(2 * _STRIP, np.float32), held)
+    line = np.empty(_STRIP, np.float32)
     for left in range(0, width, _STRIP):
         wide = min(_STRIP, width - left)
         cells = (wide + BLOCK_px - 1) // BLOCK_px
+        strip = _Cells(left // BLOCK_px, cells)
         bands[:] = _NOWHERE
         for y in range(height):
             if y % BLOCK_px == 0:
                 cell_row = y // BLOCK_px
-                _weigh(from_y[cell_row], from_y[cell_row + 1], left // BLOCK_px, cells, table, whole, weights)
+                _weigh(from_y[cell_row], from_y[cell_row + 1], strip, table, whole, weights)
             begin = 0
             while begin < cells:
                 end = _run(whole, begin, cells)
@@ -137,42 +155,38 @@ def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, ou
                 for band in range(top // BLOCK_px, (top + TAPS - 1) // BLOCK_px + 1):
                     if bands[band % _HELD_BANDS] != band:
                         bands[band % _HELD_BANDS] = band
-                        _read_band(image, band, from_x, left, cells, table, whole_along, weights_along, row, held)
+                        _read_band(image, band, from_x, strip, table, along)
                 down = np.float32(y % BLOCK_px)
-                _mean_of_rows(held, top, weights, down, begin * BLOCK_px, (end - begin) * BLOCK_px, line)
+                _mean_of_rows(held, top, weights, down, _Cells(begin, end - begin), line)
                 begin = end
             for x in range(_AT(wide)):
                 out[_AT(y), _AT(left) + x] = line[x]
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _read_band(
-    image: Image,
-    band: int,
-    from_x: Float32,
-    left: int,
-    cells: int,
-    table: Float32,
-    whole: Int64,
-    weights: Float32,
-    row: Float32,
-    held: Float32,
-) -> None:
-    """BLOCK_px rows of the source, in the strip that begins at `left`, at the places that the result asks for."""
+def _read_band(image: Image, band: int, from_x: Float32, strip: _Cells, table: Float32, room: _Room) -> None:
+    """BLOCK_px rows of the source, in a strip, at the places that the result asks for."""
+    whole, weights, row, cells = room.whole, room.weights, room.row, strip.count
     height, last = image.shape[0], from_x.shape[0] - 1
     upper, lower = from_x[min(max(band, 0), last)], from_x[min(max(band + 1, 0), last)]
-    _weigh(upper, lower, left // BLOCK_px, cells, table, whole, weights)
+    _weigh(upper, lower, strip, table, whole, weights)
     low, high = whole[0], whole[0]
     for cell in range(1, cells):
         low, high = min(low, whole[cell]), max(high, whole[cell])
     for down in range(BLOCK_px):
         y = band * BLOCK_px + down
-        _take(image, _mirrored(y, height), left + low - _BEFORE, cells * BLOCK_px + TAPS + high - low, row)
+        _take(
+            image,
+            _mirrored(y, height),
+            strip.first * BLOCK_px + low - _BEFORE,
+            cells * BLOCK_px + TAPS + high - low,
+            row,
+        )
         begin = 0
         while begin < cells:
             end = _run(whole, begin, cells)
-            at, count = begin * BLOCK_px, (end - begin) * BLOCK_px
-            _mean_along(row, whole[begin] - low, weights, np.float32(down), at, count, held, y % _HELD_ROWS)
+            run, line = _Cells(begin, end - begin), room.held[y % _HELD_ROWS]
+            _mean_along(row, whole[begin] - low, weights, np.float32(down), run, line)
             begin = end
 
 
@@ -186,16 +200,14 @@ def _run(whole: Int64, begin: int, cells: int) -> int:
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _weigh(
-    upper: Float32, lower: Float32, first: int, cells: int, table: Float32, whole: Int64, weights: Float32
-) -> None:
-    """Of a row of cells, from `first` on, whose corners have the offsets `upper` and `lower`: the whole pixels of each
-    cell, and of each column of pixels the weights in its first row (TAPS, pixels) and by what they grow from one row to
-    the next (TAPS, pixels)."""
+def _weigh(upper: Float32, lower: Float32, strip: _Cells, table: Float32, whole: Int64, weights: Float32) -> None:
+    """Of a strip's row of cells, whose corners have the offsets `upper` and `lower`: the whole pixels of each cell, and
+    of each column of pixels the weights in its first row (TAPS, pixels) and by what they grow from one row to the next
+    (TAPS, pixels)."""
     corners = np.empty((4, TAPS), np.float32)
     before, here, there = _NOWHERE, _AT(0), _AT(2)
-    for cell in range(cells):
-        at, behind = _AT(first + cell), _AT(first + cell + 1)
+    for cell in range(strip.count):
+        at, behind = _AT(strip.first + cell), _AT(strip.first + cell + 1)
         own = math.floor(np.float32(0.25) * (upper[at] + upper[behind] + lower[at] + lower[behind]))
         whole[cell] = own
         here, there = there, here
@@ -249,16 +261,14 @@ def _take(image: Image, y: int, begin: int, count: int, row: Float32) -> None:
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _mean_along(
-    row: Float32, shift: int, weights: Float32, down: np.float32, left: int, count: int, held: Float32, slot: int
-) -> None:
-    """Pixels of a source row into their place in `held`, `down` rows below their cells' first one. Weights are named
-    one by one: the processor then takes many pixels at once."""
-    w, d, to = weights[:TAPS], weights[TAPS:], _AT(slot)
+def _mean_along(row: Float32, shift: int, weights: Float32, down: np.float32, run: _Cells, line: Float32) -> None:
+    """Pixels of a source row into their place in a held line, `down` rows below their cells' first one. Weights are
+    named one by one: the processor then takes many pixels at once."""
+    w, d = weights[:TAPS], weights[TAPS:]
     k0, k1, k2, k3, k4, k5, k6, k7 = _AT(0), _AT(1), _AT(2), _AT(3), _AT(4), _AT(5), _AT(6), _AT(7)
-    for n in range(_AT(left), _AT(left + count)):
+    for n in range(_AT(run.first * BLOCK_px), _AT((run.first + run.count) * BLOCK_px)):
         x = n + _AT(shift)
-        held[to, n] = (
+        line[n] = (
             (w[k0, n] + down * d[k0, n]) * row[x]
             + (w[k1, n] + down * d[k1, n]) * row[x + k1]
             + (w[k2, n] + down * d[k2, n]) * row[x + k2]
@@ -271,16 +281,14 @@ def _mean_along(
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _mean_of_rows(
-    held: Float32, top: int, weights: Float32, down: np.float32, left: int, count: int, line: Float32
-) -> None:
+def _mean_of_rows(held: Float32, top: int, weights: Float32, down: np.float32, run: _Cells, line: Float32) -> None:
     """Pixels of a row of the result, from the 8 held rows that begin with `top`."""
     w, d = weights[:TAPS], weights[TAPS:]
     k0, k1, k2, k3, k4, k5, k6, k7 = _AT(0), _AT(1), _AT(2), _AT(3), _AT(4), _AT(5), _AT(6), _AT(7)
     r0, r1, r2, r3 = (top % _HELD_ROWS, (top + 1) % _HELD_ROWS, (top + 2) % _HELD_ROWS, (top + 3) % _HELD_ROWS)
     r4, r5, r6, r7 = ((top + 4) % _HELD_ROWS, (top + 5) % _HELD_ROWS, (top + 6) % _HELD_ROWS, (top + 7) % _HELD_ROWS)
     h0, h1, h2, h3, h4, h5, h6, h7 = held[r0], held[r1], held[r2], held[r3], held[r4], held[r5], held[r6], held[r7]
-    for n in range(_AT(left), _AT(left + count)):
+    for n in range(_AT(run.first * BLOCK_px), _AT((run.first + run.count) * BLOCK_px)):
         line[n] = (
             (w[k0, n] + down * d[k0, n]) * h0[n]
             + (w[k1, n] + down * d[k1, n]) * h1[n]

@@ -28,6 +28,7 @@ from thermostand.markers.edge_model import (
     SIGMA,
     EdgeState,
     Float,
+    Work,
     normal_distribution,
     normal_equations,
 )
@@ -125,12 +126,12 @@ def test_the_normal_equations_are_those_of_the_model():
     away = truth + np.array([0.02, -0.03, 0.002, 0.001, -0.002, 0.02, 0.5, 0.1, 0.1, -0.3, 0.1, -0.1])
     pixels = empty_pixels(41 * 41)
     image, limits = np.zeros((41, 41), np.uint8), Limits(0.0, 0.5, 1.5, 1.6)
-    gather(picture_of(image), away[:2], away[2:5], 12.0, limits, 255, pixels)
+    gather(picture_of(image), away[:5], 12.0, limits, 255, pixels)
     values = [pixels.table[region, :, : pixels.counts[region]] for region in range(3)]
     for part in values:
         part[VALUE] = model(truth, in_image(part, pixels))
     normal, right = np.empty((12, 12)), np.empty(12)
-    squares, weights = normal_equations(pixels, away, 12.0, (1.0, 0.0), normal, right, False)
+    squares, weights = normal_equations(pixels, away, 12.0, (1.0, 0.0), Work(normal, right), False)
     seen = in_image(np.concatenate(values, axis=1), pixels)
     residual = seen[VALUE] - model(away, seen)
     steps = 1e-5 * np.eye(12)
@@ -151,7 +152,7 @@ def test_pixels_are_gathered_by_where_they_lie_round_the_outline(
     shape, scale, limits = np.array([1.1, 0.08, 0.9]), 9.0, Limits(0.4, 0.7, 1.3, 1.7)
     pixels = empty_pixels(41 * 41)
     image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (41, 41), dtype)
-    gathered = gather(picture_of(image), np.array(centre), shape, scale, limits, np.iinfo(dtype).max, pixels)
+    gathered = gather(picture_of(image), np.array([*centre, *shape]), scale, limits, np.iinfo(dtype).max, pixels)
     v, u = np.mgrid[:41, :41]
     x, y = (u - centre[0]) / scale, (v - centre[1]) / scale
     F = np.sqrt(shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y)
