@@ -22,9 +22,8 @@ from thermostand.compensation.calibration.camera_file import CameraFile
 from thermostand.compensation.datasheet.datasheet import COVERAGE, Datasheet, MeasuredQuantity
 from thermostand.compensation.drift.drift_model import Outside
 from thermostand.compensation.drift.evaluation import improvement_percent
-from thermostand.compensation.reporting.drawing import calibration_figures, datasheet_figures
+from thermostand.compensation.reporting.drawing import page_figures
 from thermostand.compensation.reporting.drawing.figures import Draw, one_by_one
-from thermostand.compensation.reporting.drawing.validation_figures import bars, by_position
 from thermostand.compensation.reporting.equipment import Line, stated
 from thermostand.compensation.reporting.numbers import compact, measured, percent, significant, typeset
 from thermostand.compensation.validation3d import document
@@ -163,9 +162,9 @@ def datasheet_page(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
 
 
 def _datasheet_figures(sheet: Datasheet) -> Iterator[NamedFigure]:
-    yield "temperature", datasheet_figures.over_temperature(sheet)
+    yield "temperature", page_figures.over_temperature(sheet)
     if sheet.warming is not None:
-        yield "warm-up", datasheet_figures.warm_up(sheet.warming, sheet.by_key["settling_s"].value)
+        yield "warm-up", page_figures.warm_up(sheet.warming, sheet.by_key["settling_s"].value)
 
 
 def datasheet_json(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
@@ -236,13 +235,13 @@ def _versions() -> dict[str, str]:
 def calibration_page(file: CameraFile, calibration: CameraCalibration) -> str:
     """As HTML text; the same data give the same text."""
     drawn = {
-        "residuals": calibration_figures.residual_vectors,
-        "sizes": calibration_figures.residual_sizes,
-        "histogram": calibration_figures.normalised_histogram,
-        "uncertainty": calibration_figures.uncertainty_map,
-        **({"scores": calibration_figures.model_scores} if calibration.scores else {}),
-        "rays": calibration_figures.rays_against_pinhole,
-        "corrections": calibration_figures.corrections,
+        "residuals": page_figures.residual_vectors,
+        "sizes": page_figures.residual_sizes,
+        "histogram": page_figures.normalised_histogram,
+        "uncertainty": page_figures.uncertainty_map,
+        **({"scores": page_figures.model_scores} if calibration.scores else {}),
+        "rays": page_figures.rays_against_pinhole,
+        "corrections": page_figures.corrections,
     }
     figures = ((name, draw(calibration)) for name, draw in drawn.items())
     return page("calibration", f"Calibration of camera {file.camera_serial}", figures, file=file)
@@ -256,6 +255,6 @@ def validation_page(validation: SpatialValidation) -> str:
 
 def validation_figures(validation: SpatialValidation) -> Iterator[NamedFigure]:
     """Of that page, and of a report's part."""
-    yield "bars", bars(validation)
+    yield "bars", page_figures.deviation_bars(validation)
     for number, one in enumerate(variant for variant in (validation.after, validation.with_stand) if variant):
-        yield f"positions-{number}", by_position(validation, one)
+        yield f"positions-{number}", page_figures.by_position(validation, one)

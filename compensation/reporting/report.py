@@ -17,7 +17,7 @@ from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.model_file import save_model
 from thermostand.compensation.observations import Observations, Progress, observe
 from thermostand.compensation.reporting.drawing import report_figures as figures
-from thermostand.compensation.reporting.drawing.figures import Draw, one_by_one
+from thermostand.compensation.reporting.drawing.figures import EXAGGERATION, Draw, Paths, one_by_one, trajectories
 from thermostand.compensation.reporting.equipment import equipment_of
 from thermostand.compensation.reporting.numbers import Extras, Numbers, as_json, numbers_of, table_positions
 from thermostand.compensation.reporting.pages import NamedFigure, orientation, page, validation_figures
@@ -161,7 +161,7 @@ def page_of(
         candidates=[*paper, *others],
         listed_candidates=len(paper) + _MOST_THERMAL,
         best=[min(ones, key=_held_out) for ones in (paper, others) if ones],
-        enlarged=figures.EXAGGERATION,
+        enlarged=EXAGGERATION,
         curve_points=figures.CURVE_POINTS,
         roles={role for session in numbers.sessions for role in session.frames_by_role},
         moved_roles=set(figures.MOVED_ON_PURPOSE),
@@ -186,7 +186,7 @@ def figures_of(
         yield "residual-map", figures.residual_map(observations, evaluation)
         yield "fit", figures.measured_against_model(evaluation)
         yield "residuals", figures.residuals(evaluation)
-        yield "histogram", figures.histogram(evaluation)
+        yield "histogram", figures.deviation_histograms(evaluation)
         yield "temperature", figures.against_temperature(evaluation)
     if extras.positions.calibration or extras.positions.poses:
         yield "table", figures.positions_figure(extras.positions, observations.target)
@@ -200,17 +200,17 @@ def _drift_figures(observations: Observations, numbers: Numbers) -> Iterator[Nam
         titles = [orientation(roll_deg) if len(numbers.warm_ups) > 1 else "" for roll_deg in rolls_deg]
         yield "warm-up-curves", figures.warm_up_curves(observations, shown, titles)
         panels = [_panel(observations, one.track, title) for one, title in zip(shown, titles, strict=True)]
-        yield "warm-up-paths", figures.trajectories(observations, panels)
+        yield "warm-up-paths", trajectories(observations, panels)
     gaps = [
         {one.session_id: one.gaps for one in found} for found in (numbers.hysteresis_before, numbers.hysteresis_after)
     ]
     for index, facts in enumerate(observations.sessions):
         if (track := cycle(observations, index)) is not None:
-            yield f"cycle-{index}", figures.trajectories(observations, [_panel(observations, track, "")])
+            yield f"cycle-{index}", trajectories(observations, [_panel(observations, track, "")])
             before, after = gaps[0][facts.session_id], gaps[1].get(facts.session_id, ())
             yield f"branches-{index}", figures.branches(visits(observations, track), before, after)
     yield "time", figures.against_time(observations)
 
 
-def _panel(observations: Observations, track: Track, title: str) -> figures.Paths:
-    return figures.Paths(title, track.start_px, track.moved_px, observations.camera_degC[track.frames])
+def _panel(observations: Observations, track: Track, title: str) -> Paths:
+    return Paths(title, track.start_px, track.moved_px, observations.camera_degC[track.frames])

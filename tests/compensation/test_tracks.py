@@ -10,8 +10,7 @@ import pytest
 from thermostand.compensation.history.thermal_history import ThermalHistory
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.compensation.reporting.drawing import report_figures
-from thermostand.compensation.reporting.drawing.figures import as_svg
-from thermostand.compensation.reporting.drawing.report_figures import Paths, trajectories
+from thermostand.compensation.reporting.drawing.figures import Paths, as_svg, trajectories
 from thermostand.compensation.reporting.tracks import cycle, moved_px, thinned, visits, warm_ups
 from thermostand.experiments.steps import Role
 

@@ -9,10 +9,11 @@ import io
 import math
 import pickle
 import re
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,12 +23,17 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.quiver import Quiver
+from matplotlib.patches import Rectangle
+from numpy.typing import ArrayLike
 
 from thermostand.compensation.finding.workers import pool
-from thermostand.compensation.observations import Float
+from thermostand.compensation.observations import Float, Observations
+from thermostand.compensation.reporting.tracks import thinned
 
 I_COLOUR, J_COLOUR = "#0072B2", "#D55E00"
 CAMERA_COLOUR, GREY, WARM_UP_COLOUR = "#CC79A7", "#6b6b6b", "#F0E442"
@@ -57,6 +63,12 @@ _STYLE = {
 _NO_METADATA = {"Date": None, "Creator": None, "Type": None, "Format": None}
 _RASTER_DPI = 150
 _LEGEND_MARKER = 3.5
+EXAGGERATION = 100
+_PATH_POINTS = 600
+_SAME_VIEW_PX = 5.0
+_BOX = {"boxstyle": "square,pad=0.15", "facecolor": PALE, "edgecolor": "none", "alpha": 0.8}
+_GREY_STEP = 8
+"""A coarser picture has no noise to store."""
 
 
 def style() -> AbstractContextManager[None]:
@@ -88,8 +100,6 @@ def new_figure(
         across = panels[row * columns] if share and column else None
         down = panels[column] if share and row else None
         panels.append(figure.add_subplot(rows, columns, number + 1, sharex=down, sharey=across))
-        if share:
-            panels[-1].label_outer()
     return figure, panels
 
 
@@ -101,6 +111,97 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
             handle.set(markersize=max(handle.get_markersize(), _LEGEND_MARKER), alpha=1)
 
 
+Mark = Callable[[Axes], object]
+"""Something that is drawn in a panel."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """marks: drawn one after the other. title: above, at the left. legend: its columns, 0: without one. look: of the
+    axes, as matplotlib's `Axes.set` takes it: labels, limits, scales."""
+
+    marks: Sequence[Mark]
+    title: str = ""
+    legend: int = 3
+    look: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+
+def panels(
+    columns: int, height_in: float, shown: Sequence[Panel], *, share: bool = True, one_legend: bool = False
+) -> Figure:
+    """Panels in rows. share: those in a column have one x axis, those in a row one y axis, labelled at the outer ones
+    only. one_legend: that of the first panel, for all."""
+    with style():
+        figure, places = new_figure(FULL_WIDTH_IN, height_in, -(-len(shown) // columns), columns, share=share)
+        for axes, panel in zip(places, shown, strict=True):
+            for mark in panel.marks:
+                mark(axes)
+            axes.set(**panel.look)
+            if panel.title:
+                axes.set_title(panel.title, fontsize=9, loc="left", pad=20 if panel.legend and not one_legend else None)
+            if share:
+                axes.label_outer()
+            if panel.legend and not one_legend:
+                legend_above(axes, panel.legend)
+        if one_legend:
+            handles, labels = places[0].get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside upper left", ncols=4, handlelength=1.6)
+    return figure
+
+
+def curve(
+    x: ArrayLike, y: ArrayLike, colour: str, label: str | None = None, *, error: ArrayLike | None = None, **look: Any
+) -> Mark:
+    """Points (M,) and what joins them; error (M,): half of each one's bar along y. look: as matplotlib's lines have
+    it."""
+    usual = {"linewidth": 1.0, "markersize": 4, "color": colour, "label": label}
+    if error is None:
+        return lambda axes: axes.plot(x, y, **usual | look)
+    return lambda axes: axes.errorbar(x, y, error, **usual | look)
+
+
+def dots(x: ArrayLike, y: ArrayLike, colour: str, label: str) -> Mark:
+    """Many single points, as a picture: the page does not grow with their number."""
+    small = {"marker": "o", "linestyle": "", "markersize": 2, "markeredgewidth": 0}
+    return curve(x, y, colour, label, alpha=0.5, rasterized=True, **small)
+
+
+def rule(at: float, label: str | None = None, *, upright: bool = False, colour: str = GREY, style: str = "--") -> Mark:
+    """A line through the whole panel."""
+    look = {"color": colour, "linewidth": 0.8, "linestyle": style, "label": label}
+    return lambda axes: axes.axvline(at, **look) if upright else axes.axhline(at, **look)
+
+
+def span(begin: float, end: float, colour: str, label: str | None) -> Mark:
+    """A band behind the panel from left to right of it."""
+    return lambda axes: axes.axvspan(begin, end, color=colour, alpha=0.25, linewidth=0, label=label)
+
+
+def band(x: Float, reach: Float, label: str) -> Mark:
+    """From -reach to reach (M,) about 0."""
+    return lambda axes: axes.fill_between(x, -reach, reach, color="#dddddd", linewidth=0, label=label)
+
+
+def histogram(values: Float, bins: Any, colour: str, label: str, **look: Any) -> Mark:
+    """How often values (M,) occur."""
+    return lambda axes: axes.hist(values, bins, color=colour, label=label, **look)
+
+
+def bars(places: Float, height: Float, error: Float, colour: str, label: str) -> Mark:
+    """Upright bars (M,) with their uncertainties."""
+    return lambda axes: axes.bar(places, height, 0.4, yerr=error, color=colour, error_kw={"lw": 0.8}, label=label)
+
+
+def words(x: float, y: float, text: str, colour: str) -> Mark:
+    """Written at a place."""
+    return lambda axes: axes.text(x, y, text, color=colour, ha="center", va="center", fontweight="bold")
+
+
+def rising_colours() -> Colormap:
+    """Of values from low to high: plasma without its yellow, which does not show on white."""
+    return ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.88, 256)))
+
+
 def image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
     """Those of an image (width, height), px."""
     width, height = image_size
@@ -110,21 +211,30 @@ def image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
 
 
 def arrows(
-    axes: Axes, at_px: Float, moved_px: Float, image_size: tuple[int, int], *colours: Float, **look: Any
-) -> Quiver:
-    """Motions (M, 2) of places (M, 2) over the image, enlarged until the larger ones show; a bar says how much. colours
-    (M,): a value of each. look: of the arrows."""
+    at_px: Float, moved_px: Float, image_size: tuple[int, int], values: Float | None = None, label: str = ""
+) -> Figure:
+    """Motions (M, 2) of places (M, 2) over the image, enlarged until the larger ones show; a bar says how much. values
+    (M,): their colours, which a scale with the label explains."""
+    scale, bar_px = enlarged(float(np.quantile(np.linalg.norm(moved_px, axis=1), 0.95)), image_size[0])
+    with style():
+        figure, (axes,) = new_figure(FULL_WIDTH_IN, 5.4, 1, 1)
+        look: dict[str, Any] = {"color": I_COLOUR} if values is None else {"cmap": rising_colours()}
+        look |= {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0016, "rasterized": True}
+        drawn = axes.quiver(*at_px.T, *(scale * moved_px).T, *(() if values is None else (values,)), **look)
+        image_axes(axes, image_size)
+        axes.set_facecolor(PALE)
+        _bar(axes, image_size, scale * bar_px, f"{1e3 * bar_px:g} mpx, {scale:,.0f} times")
+        if values is not None:
+            figure.colorbar(drawn, ax=axes, label=label, shrink=0.85, pad=0.02)
+    return figure
+
+
+def _bar(axes: Axes, image_size: tuple[int, int], length_px: float, text: str) -> None:
+    """At the lower left of an image, what a motion looks like that is drawn so long."""
     width, height = image_size
-    scale, bar_px = enlarged(float(np.quantile(np.linalg.norm(moved_px, axis=1), 0.95)), width)
-    lengths = {"angles": "xy", "scale_units": "xy", "scale": 1}
-    drawn = axes.quiver(*at_px.T, *(scale * moved_px).T, *colours, **lengths, **look)
-    drawn.set_rasterized(True)
-    image_axes(axes, image_size)
     x, y = 0.03 * width, 0.965 * height
-    axes.plot([x, x + scale * bar_px], [y, y], color=ON_PALE, linewidth=2, solid_capstyle="butt")
-    text = f"{1e3 * bar_px:g} mpx, {scale:,.0f} times"
-    axes.text(x + scale * bar_px + 0.01 * width, y, text, va="center", fontsize=8, color=ON_PALE)
-    return drawn
+    axes.plot([x, x + length_px], [y, y], color=ON_PALE, linewidth=2, solid_capstyle="butt")
+    axes.text(x + length_px + 0.01 * width, y, text, va="center", fontsize=8, color=ON_PALE, bbox=_BOX)
 
 
 def enlarged(long_px: float, width: int) -> tuple[float, float]:
@@ -133,6 +243,104 @@ def enlarged(long_px: float, width: int) -> tuple[float, float]:
     power = 10 ** math.floor(math.log10(wanted))
     scale = next(step * power for step in (5, 2, 1) if step * power <= wanted)
     return scale, 10 ** math.floor(math.log10(0.1 * width / scale))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paths:
+    """One panel of paths: start_px (N, 2), moved_px (F, N, 2) from there, camera_degC (F,)."""
+
+    title: str
+    start_px: Float
+    moved_px: Float
+    camera_degC: Float
+
+
+def trajectories(observations: Observations, shown: Sequence[Paths]) -> Figure:
+    """Each marker's path x100, two panels in a row, coloured by the camera's temperature.
+
+    The ground is the first frame, or the outlines of the discs where the camera stood differently.
+    """
+    columns = min(2, len(shown))
+    rows = -(-len(shown) // columns)
+    known = np.concatenate([panel.camera_degC for panel in shown])
+    norm = Normalize(float(np.nanmin(known)), float(np.nanmax(known)))
+    with style():
+        figure, places = new_figure(FULL_WIDTH_IN, (5.5 if columns == 1 else 3.3) * rows, rows, columns)
+        for panel, axes in zip(shown, places, strict=False):
+            _ground(axes, observations, panel.start_px)
+            axes.set_title(panel.title, fontsize=9, loc="left")
+            drawn = thinned(len(panel.moved_px), _PATH_POINTS)
+            path = panel.start_px + EXAGGERATION * panel.moved_px[drawn]
+            colour = np.broadcast_to(panel.camera_degC[drawn][:, None], path.shape[:2])
+            good = np.isfinite(path).all(axis=2)
+            look: dict[str, Any] = {"s": 5, "cmap": rising_colours(), "norm": norm, "linewidths": 0}
+            axes.scatter(*path[good].T, c=colour[good], rasterized=True, **look)
+            axes.label_outer()
+        for spare in places[len(shown) :]:
+            spare.remove()
+        scale = ScalarMappable(norm, rising_colours())
+        figure.colorbar(scale, ax=places[: len(shown)], label="camera temperature (°C)", shrink=0.85, pad=0.02)
+    return figure
+
+
+def _ground(axes: Axes, observations: Observations, start_px: Float) -> None:
+    width, height = observations.image_size
+    first = observations.centres_px[int(np.argmax(observations.usable))]
+    away_px = np.linalg.norm(first - start_px, axis=1)
+    if np.isfinite(away_px).any() and np.nanmedian(away_px) < _SAME_VIEW_PX:
+        axes.imshow(
+            observations.preview // _GREY_STEP * _GREY_STEP,
+            cmap="gray",
+            vmin=-200,  # darks become mid-grey: the dots must stand out from the discs
+            vmax=290,  # and lights pale grey
+            extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+            interpolation="none",
+        )
+    else:
+        _outlines(axes, observations, start_px)
+    image_axes(axes, observations.image_size)
+    _bar(axes, observations.image_size, 0.5 * EXAGGERATION, "0.5 px of drift")
+
+
+def _outlines(axes: Axes, observations: Observations, start_px: Float) -> None:
+    """Discs whose size follows from the distance of their neighbours."""
+    axes.set_facecolor(PALE)
+    seen = np.isfinite(start_px).all(axis=1)
+    apart_px = np.linalg.norm(start_px[seen][:, None] - start_px[seen], axis=2)
+    np.fill_diagonal(apart_px, np.inf)
+    px_per_mm = float(np.median(apart_px.min(axis=1))) / observations.target.spacing_mm
+    diameters = observations.target.diameters_mm()[seen] * px_per_mm
+    look: dict[str, Any] = {"facecolors": "#969696", "edgecolors": "none"}
+    places = {"units": "xy", "offsets": start_px[seen], "offset_transform": axes.transData}
+    axes.add_collection(EllipseCollection(diameters, diameters, np.zeros_like(diameters), **places, **look))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heights:
+    """Values (H, W) at pixels (H, W, 2); NaN where nothing is known."""
+
+    pixels: Float
+    values: Float
+    label: str
+
+
+def contours(shown: Sequence[Heights], image_size: tuple[int, int], seen_px: Float) -> Figure:
+    """Values over the image side by side, hatched grey where they are not known; white dots (M, 2): seen markers."""
+    with style():
+        figure, places = new_figure(FULL_WIDTH_IN, 3.4, 1, len(shown))
+        for axes, one in zip(places, shown, strict=True):
+            columns, rows, known = one.pixels[..., 0], one.pixels[..., 1], np.isfinite(one.values)
+            if known.any():
+                drawn = axes.contourf(columns, rows, np.ma.masked_invalid(one.values), levels=12, cmap="viridis")
+                figure.colorbar(drawn, ax=axes, label=one.label, orientation="horizontal", pad=0.02, shrink=0.9)
+            axes.plot(*seen_px.T, ",", color="white", alpha=0.5, rasterized=True)
+            image_axes(axes, image_size)
+            axes.label_outer()
+            if not known.all():
+                hatched: dict[str, Any] = {"facecolor": "#d9d9d9", "edgecolor": GREY, "hatch": "///", "zorder": -1}
+                axes.add_patch(Rectangle((0, 0), 1, 1, label="not seen here", transform=axes.transAxes, **hatched))
+                legend_above(axes)
+    return figure
 
 
 # Figures as SVG text for a page, one after the other or by two processes; the same bytes.
