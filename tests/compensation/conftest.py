@@ -6,11 +6,11 @@ import asyncio
 import fcntl
 import itertools
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -80,6 +80,46 @@ def published(index: int, time_ns: int, bits: int = 8) -> Iterator[Item]:
     yield Frame("camera.image", image, time_ns, 0.1, 0.0, chamber_degC + 20, index, 0, 0, f"step-{index}")
 
 
+STAND = {"thermometers": "thermometers", "camera": "camera"}
+
+
+@asynccontextmanager
+async def recording(
+    directory: Path,
+    devices: Mapping[str, str] = STAND,
+    attachments: Mapping[str, str] = {"target.yaml": TARGET_YAML},
+    *,
+    session_id: str = "",
+    recipe: str = "thermal-cycle",
+    serials: str = "TS-0001",
+) -> AsyncIterator[tuple[Hub, VirtualClock]]:
+    """A recorder under way from START_NS on: what is published is on the disk at the end."""
+    clock, hub = VirtualClock(START_NS), Hub()
+    info = SessionInfo(session_id or directory.name, recipe, serials, "operator", "0.1.0", "virtual")
+    settings = RecordingSettings(telemetry_commit_s=60.0)
+    recorder = Recorder(directory, info, dict(attachments), dict(devices), hub, clock, settings)
+    recorder.start()
+    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
+    yield hub, clock
+    await clock.sleep_until(clock.now_ns() + NS_PER_S)
+    for task in tasks:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+    await recorder.finish()
+
+
+async def record_items(
+    directory: Path, items: Callable[[int, int], Iterable[Item]], count: int, every_s: int, **how: Any
+) -> None:
+    """A session of what `items` gives for 0, 1, ... and the instant, ns, so often; how: as `recording` takes it."""
+    async with recording(directory, **how) as (hub, clock):
+        for index in range(count):
+            await clock.sleep_until(START_NS + index * every_s * NS_PER_S)
+            for item in items(index, clock.now_ns()):
+                hub.publish(item)
+
+
 async def record(
     directory: Path,
     attachments: dict[str, str],
@@ -88,24 +128,13 @@ async def record(
     bits: int = 8,
 ) -> None:
     """The first frames of the sequence, one a minute; events come right after the frame of that index."""
-    clock, hub = VirtualClock(START_NS), Hub()
-    info = SessionInfo(directory.name, "thermal-cycle", "TS-0001", "operator", "0.1.0", "virtual")
-    devices = {"thermometers": "thermometers", "camera": "camera"}
-    recorder = Recorder(directory, info, attachments, devices, hub, clock, RecordingSettings(telemetry_commit_s=60.0))
-    recorder.start()
-    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
-    for index in range(frames):
-        await clock.sleep_until(START_NS + index * 60 * NS_PER_S)
-        for item in published(index, clock.now_ns(), bits):
-            hub.publish(item)
+
+    def items(index: int, time_ns: int) -> Iterator[Item]:
+        yield from published(index, time_ns, bits)
         if events and index in events:
-            hub.publish(events[index])
-    await clock.sleep_until(clock.now_ns() + NS_PER_S)
-    for task in tasks:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-    await recorder.finish()
+            yield events[index]
+
+    await record_items(directory, items, frames, 60, attachments=attachments)
 
 
 def compile_fit(lock: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,16 +25,14 @@ from thermostand.compensation.budget.budget import (
 )
 from thermostand.compensation.budget.geometry import Geometry, StandState, load_geometry
 from thermostand.drivers.sim.physics import optics
-from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.target import load_target
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.stand.config.stand_config import packaged
 
+from .conftest import record_items
 from .rendered import Scene, photograph, render
 
 PAPER = load_geometry("paper")
@@ -173,7 +170,9 @@ CAPTURES = (
 REPEAT_px = 0.4
 
 
-def published(index: int, time_ns: int, started: bool) -> Iterator[Item]:
+def published(number: int, time_ns: int) -> Iterator[Item]:
+    """Each capture begins and ends."""
+    index, started = number // 2, number % 2 == 0
     role, state = CAPTURES[index]
     names = ("granite_inside", "granite_outside", "artifact", "air", "laboratory")
     readings = tuple(Reading(f"thermometers.{n}", getattr(state, f"{n}_degC"), "degC", time_ns) for n in names)
@@ -189,32 +188,12 @@ def published(index: int, time_ns: int, started: bool) -> Iterator[Item]:
         yield Event(time_ns, "info", "home_residual", "linear: home was at 0.00300 mm (0.24 steps)", data)
 
 
-async def record(directory: Path) -> None:
-    start_ns = 1_767_290_400 * NS_PER_S
-    clock, hub = VirtualClock(start_ns), Hub()
-    info = SessionInfo("night", "validation", "TS-0001", "operator", "0.1.0", "virtual")
-    attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text()}
-    devices = {"thermometers": "thermometers", "camera": "camera"}
-    recorder = Recorder(directory, info, attachments, devices, hub, clock, RecordingSettings(telemetry_commit_s=60.0))
-    recorder.start()
-    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
-    for index in range(len(CAPTURES)):
-        for started in (True, False):
-            await clock.sleep_until(start_ns + (index * 60 + 30 * (not started)) * NS_PER_S)
-            for item in published(index, clock.now_ns(), started):
-                hub.publish(item)
-    await clock.sleep_until(clock.now_ns() + NS_PER_S)
-    for task in tasks:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-    await recorder.finish()
-
-
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sessions") / "night"
-    asyncio.run(record(path))
+    attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text()}
+    how = {"session_id": "night", "recipe": "validation", "attachments": attachments}
+    asyncio.run(record_items(path, published, 2 * len(CAPTURES), 30, **how))
     return path
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +23,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Frame, Quality, Reading
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
+from .conftest import recording
 from .rendered import Scene, photograph, render, true_centres_px
 
 START_NS = 1_767_290_400 * NS_PER_S
@@ -55,20 +54,10 @@ class Recorded:
 
 
 async def record(directory: Path, role: str, places: Sequence[tuple[float, float]] = PLACES) -> None:
-    clock, hub = VirtualClock(START_NS), Hub()
-    info = SessionInfo(directory.name, "calibration", "TS-0001", "operator", "0.1.0", "virtual")
     devices = {"linear": "axis", "rotary": "axis", "camera": "camera"}
-    settings = RecordingSettings(telemetry_commit_s=60.0)
-    recorder = Recorder(directory, info, {"target.yaml": TARGET_YAML}, devices, hub, clock, settings)
-    recorder.start()
-    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
-    for number, place in enumerate(places):
-        await publish_visit(hub, clock, number, place, role)
-    for task in tasks:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-    await recorder.finish()
+    async with recording(directory, devices, {"target.yaml": TARGET_YAML}, recipe="calibration") as (hub, clock):
+        for number, place in enumerate(places):
+            await publish_visit(hub, clock, number, place, role)
 
 
 async def publish_visit(hub: Hub, clock: VirtualClock, number: int, place: tuple[float, float], role: str) -> None:

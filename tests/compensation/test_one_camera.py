@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,15 +16,12 @@ from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, 
 from thermostand.compensation.history.thermal_history import recorded_history
 from thermostand.compensation.observations import observe
 from thermostand.compensation.one_camera import name_of, own_frames, take
-from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Item
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
-from .conftest import START_NS, TARGET_YAML, published
+from .conftest import STAND, published, record_items
 
 FRAMES, APART_NS, WARMER_K = 3, 1_000_000, 7.0
 
@@ -41,30 +37,11 @@ def of_both(index: int, time_ns: int) -> Iterator[Item]:
                 yield Batch(name, later_ns, (Reading(f"{name}.temperature", degC, "degC", later_ns),))
 
 
-async def record(directory: Path) -> None:
-    clock, hub = VirtualClock(START_NS), Hub()
-    info = SessionInfo(directory.name, "thermal-cycle", "TS-0001, TS-0002", "operator", "0.1.0", "virtual")
-    devices = {"thermometers": "thermometers", "camera": "camera", "side": "camera"}
-    settings = RecordingSettings(telemetry_commit_s=60.0)
-    recorder = Recorder(directory, info, {"target.yaml": TARGET_YAML}, devices, hub, clock, settings)
-    recorder.start()
-    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
-    for index in range(FRAMES):
-        await clock.sleep_until(START_NS + index * 60 * NS_PER_S)
-        for item in of_both(index, clock.now_ns()):
-            hub.publish(item)
-    await clock.sleep_until(clock.now_ns() + NS_PER_S)
-    for task in tasks:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-    await recorder.finish()
-
-
 @pytest.fixture(scope="module")
 def two_cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("several") / "night"
-    asyncio.run(record(path))
+    devices = {**STAND, "side": "camera"}
+    asyncio.run(record_items(path, of_both, FRAMES, 60, devices=devices, serials="TS-0001, TS-0002"))
     return path
 
 

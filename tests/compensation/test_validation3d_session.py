@@ -6,8 +6,8 @@ import asyncio
 import json
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from math import isnan
 from pathlib import Path
 
@@ -26,16 +26,15 @@ from thermostand.compensation.drift.paper_model import fit_paper
 from thermostand.compensation.observations import Float, Observations, observe_session, session_target
 from thermostand.compensation.validation3d.validate import validation_frames
 from thermostand.experiments.steps import Role
-from thermostand.foundation.clock import NS_PER_S, VirtualClock
+from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame, Quality, Reading
 from thermostand.markers.target import Target
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
+from .conftest import record_items
 from .rendered import Scene, photograph, render, true_centres_px
 from .synthetic import observations as thermal_cycle
 
@@ -83,23 +82,8 @@ def published(index: int, time_ns: int, silent: str) -> Iterator[Item]:
 
 
 async def record(directory: Path, visits: int = len(VISITS), silent: str = "") -> None:
-    clock, hub = VirtualClock(START_NS), Hub()
-    info = SessionInfo("night-2", "validation", "TS-0001", "operator", "0.1.0", "virtual")
-    devices = {"thermometers": "thermometers", "camera": "camera"}
-    settings = RecordingSettings(telemetry_commit_s=60.0)
-    recorder = Recorder(directory, info, {"target.yaml": TARGET_YAML}, devices, hub, clock, settings)
-    recorder.start()
-    tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
-    for index in range(visits):
-        await clock.sleep_until(START_NS + index * 30 * NS_PER_S)
-        for item in published(index, clock.now_ns(), silent):
-            hub.publish(item)
-    await clock.sleep_until(clock.now_ns() + NS_PER_S)
-    for task in tasks:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-    await recorder.finish()
+    how = {"session_id": "night-2", "recipe": "validation", "attachments": {"target.yaml": TARGET_YAML}}
+    await record_items(directory, partial(published, silent=silent), visits, 30, **how)
 
 
 def calibration_positions() -> Positions:
