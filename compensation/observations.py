@@ -30,8 +30,7 @@ from thermostand.markers.noise import Noise, estimate_noise
 from thermostand.markers.target import Target
 from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.format.utc_offsets import UtcOffsets
-from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.using import Say, open_whole
+from thermostand.recording.reading.session import Say, Session, open_whole
 
 # Whether all frames of a session are of one thermal equilibrium of the camera.
 #

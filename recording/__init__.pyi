@@ -5,6 +5,6 @@ from thermostand.foundation.readings import Frame as Frame
 from thermostand.recording.exporting.export import export as export
 from thermostand.recording.exporting.trim import trim as trim
 from thermostand.recording.reading.frames_table import FramesTable as FramesTable
+from thermostand.recording.reading.scan import verify as verify
 from thermostand.recording.reading.session import Session as Session
-from thermostand.recording.reading.using import open_whole as open_whole
-from thermostand.recording.repair.verify import verify as verify
+from thermostand.recording.reading.session import open_whole as open_whole

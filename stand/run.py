@@ -36,10 +36,10 @@ from thermostand.foundation.progress import late_progress
 from thermostand.foundation.readings import Quality
 from thermostand.foundation.repeats import RepeatLimit
 from thermostand.foundation.tasks import cancelled, cause_of, failure_text
+from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
 from thermostand.recording.writing.disk import REPAIR_LINE, Disk, DiskCalls
 from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
-from thermostand.recording.writing.recorder_settings import SessionInfo
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.safe_ranges import accepted_text
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged

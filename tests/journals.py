@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from thermostand.recording.reading.journal_lines import journal_lines, lines_of, mark_of
+from thermostand.recording.format.journal_lines import journal_lines, lines_of, mark_of
 from thermostand.stand.running.memory.entries import Written, decoded, encoded
 
 MARK = mark_of("a session")

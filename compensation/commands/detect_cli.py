@@ -30,8 +30,7 @@ from thermostand.markers.detection import Detection, DetectionError, Image, dete
 from thermostand.markers.detections_table import CENTRES, DetectedImage, write_detections
 from thermostand.markers.image_file import read_image
 from thermostand.markers.target import Target
-from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.using import open_whole
+from thermostand.recording.reading.session import Session, open_whole
 
 app = App()
 

@@ -19,8 +19,7 @@ from thermostand.foundation.output import say
 from thermostand.foundation.progress import Report, late_progress, progress
 from thermostand.markers.detections_table import doubt
 from thermostand.markers.target import Target, load_target
-from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.using import Say, open_whole
+from thermostand.recording.reading.session import Say, Session, open_whole
 
 TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")

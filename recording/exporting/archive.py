@@ -23,8 +23,8 @@ from thermostand.foundation.files import make_durable_folder, replace_file, sync
 from thermostand.foundation.json_values import json_object
 from thermostand.foundation.lock_file import try_lock
 from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.format.journal_lines import JOURNAL_NAME
 from thermostand.recording.reading.catalogue import DELETED, Entry, contents_of
-from thermostand.recording.reading.journal_lines import JOURNAL_NAME
 from thermostand.recording.reading.notes import NOTES_NAME, Archived, add_archived
 from thermostand.recording.reading.run_word import Files, Run
 

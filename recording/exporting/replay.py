@@ -24,7 +24,7 @@ from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
 from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.format.holes import holes_text
-from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.format.journal_lines import JOURNAL_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
@@ -119,8 +119,8 @@ async def replay_and_record(
         try:
             await _beside(replay(session, hub, clock), background)
         finally:
+            _copy_journal(session, folder)  # before the manifest is written last, which has its hash
             await recorder.finish()
-        _copy_journal(session, folder)
         if recorder.frames_lost:
             raise SessionError(
                 f"{out}: {recorder.frames_lost} frames could not be written; is the disk full or too slow?"

@@ -25,9 +25,10 @@ from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
 from thermostand.recording.format.utc_offsets import offset_event
-from thermostand.recording.reading.extent import Extent, extent_of
+from thermostand.recording.reading.run_word import Extent, extent_of
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import frames_topic
+from thermostand.recording.writing.manifest_file import write_manifest
 from thermostand.recording.writing.recorder import RecordingSettings
 from thermostand.recording.writing.segment import Record, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
@@ -61,6 +62,7 @@ def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     with new_folder(out) as folder:
         _write_telemetry(session, metadata, folder / TELEMETRY, telemetry, first_ns)
         _write_frames(session, metadata, folder / FRAMES, places)
+        write_manifest(folder)
     return out
 
 

@@ -1,16 +1,32 @@
-"""The files a recorded session consists of, in any state; only names, sizes and locks are looked at."""
+"""The files a recorded session consists of, in any state; only names, sizes and locks are looked at.
+
+The segments of a series are a chain: each says of which session it is and which number it has. Missing numbers are
+ranges: a file of any number costs nothing.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import re
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 from pathlib import Path
 
-from thermostand.recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
+from thermostand.recording.format.layout import (
+    DAMAGED,
+    FINISHED,
+    FRAMES,
+    SESSION_CRC,
+    TELEMETRY,
+    UNFINISHED,
+    segment_metadata,
+)
+
+MOST_MISSING = 10_000  # segments; a night has hundreds
 
 
 class State(StrEnum):
@@ -99,3 +115,27 @@ def is_locked(path: Path) -> bool:
     finally:
         os.close(fd)
     return False
+
+
+def misplaced(series: str, number: int, place: Mapping[str, str], session: Mapping[str, str]) -> bool:
+    """Whether the record `segment` gives another place in the session than the file's name: it was doubled, swapped or
+    renamed."""
+    due = segment_metadata(series, number, session)
+    return bool(place.keys() - due.keys()) or any(place.get(key) != due[key] for key in due.keys() - {SESSION_CRC})
+
+
+def foreign_numbers(numbers: Iterable[int]) -> set[int]:
+    """Those that no segment of the session can have: behind more missing ones than any session has segments."""
+    known = sorted(set(numbers))
+    for place, (before, after) in enumerate(pairwise([-1, *known])):
+        if after - before > MOST_MISSING:
+            return set(known[place:])
+    return set()
+
+
+def missing_numbers(numbers: Iterable[int]) -> Iterator[tuple[int, int]]:
+    """(first, last) of each range of numbers from 0 on that is not there; foreign ones do not count."""
+    known = set(numbers)
+    for before, after in pairwise([-1, *sorted(known - foreign_numbers(known))]):
+        if after > before + 1:
+            yield before + 1, after - 1

@@ -65,14 +65,24 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
+class MessageSpan:
+    """How many messages a segment has, and the times of the first and the last."""
+
+    count: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Head:
     """The first records of a segment. place: the record `segment`, its place in the session; salvaged: the record
-    `salvage`, empty for a segment that its recorder finished itself."""
+    `salvage`, empty for a segment that its recorder finished itself; span: by its index."""
 
     session: dict[str, str]
     attachments: dict[str, str]
     place: dict[str, str]
     salvaged: dict[str, str]
+    span: MessageSpan
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,20 +104,11 @@ class FramePlace:
         return self.meta.block_id & SEQUENCE_MASK
 
 
-@dataclass(frozen=True, slots=True)
-class MessageSpan:
-    """How many messages a segment has, and the times of the first and the last."""
-
-    count: int
-    first_ns: int
-    last_ns: int
-
-
 def read_head(path: Path) -> Head:
     """Metadata `session` and the attachments of a finished segment."""
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
-        head = _head(path, file)
+        head = _head(path, file, summary)
         if len(head.attachments) != summary.statistics.attachment_count - (FRAME_TABLE in summary.attachments()):
             raise ValueError("its attachments are not those that its index lists")
         return head
@@ -126,7 +127,7 @@ def _open(path: Path, file: BinaryIO) -> Summary:
     return summary
 
 
-def _head(path: Path, file: BinaryIO) -> Head:
+def _head(path: Path, file: BinaryIO, summary: Summary) -> Head:
     size = path.stat().st_size
     found: dict[str, dict[str, str]] = {}
     attachments: dict[str, str] = {}
@@ -147,7 +148,9 @@ def _head(path: Path, file: BinaryIO) -> Head:
         raise SessionError(f"{path}: not a segment of a thermostand session")
     if contradicts(found.get(SEGMENT_METADATA, {}), session):
         raise ValueError("the session's metadata do not fit their CRC")
-    return Head(session, attachments, found.get(SEGMENT_METADATA, {}), found.get(SALVAGE_METADATA, {}))
+    totals = summary.statistics
+    span = MessageSpan(totals.message_count, totals.message_start_time, totals.message_end_time)
+    return Head(session, attachments, found.get(SEGMENT_METADATA, {}), found.get(SALVAGE_METADATA, {}), span)
 
 
 @lru_cache(16)  # each segment of a session has the session's
@@ -233,13 +236,6 @@ def _message_places(chunk: memoryview, wanted: Container[int]) -> list[tuple[int
 def _message(topic: str, chunk: memoryview, offset: int, end: int) -> Message:
     sequence, time_ns, _ = _MESSAGE_REST.unpack_from(chunk, offset + _MESSAGE_START.size)
     return Message(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]))
-
-
-def message_span(path: Path) -> MessageSpan:
-    """How many messages a segment has and when, from its statistics alone."""
-    with reading(path), path.open("rb") as file:
-        statistics = _open(path, file).statistics
-        return MessageSpan(statistics.message_count, statistics.message_start_time, statistics.message_end_time)
 
 
 def frame_places(path: Path) -> list[FramePlace]:

@@ -22,16 +22,17 @@ from typing import TYPE_CHECKING, Any, cast
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.version import installed_version
 from thermostand.recording.format.inventory import is_locked
+from thermostand.recording.format.journal_lines import JOURNAL_NAME
 from thermostand.recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
-from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.reading.notes import NOTES_NAME, Archived, Note, read_notes
 
 if TYPE_CHECKING:
-    from thermostand.recording.reading.glance import Glance
+    from thermostand.recording.reading.scan import Scan
 
 INDEX_NAME = ".sessions.sqlite"
 DELETED = ".deleted"  # of a folder that is being deleted, behind a dot and its name
-_VERSION = 3  # of the index; the program's version counts, too, for what it says of a session
+_VERSION = 4  # of the index; the program's version counts, too, for what it says of a session
 _BUSY_S = 1.0  # how long another one that writes the index is waited for
 _SCHEMA = "CREATE TABLE sessions (name BLOB PRIMARY KEY, sealed TEXT NOT NULL, entry TEXT NOT NULL)"
 _File = tuple[str, int, int, bool]  # name, size, time of its last change in ns, whether a recorder has it open
@@ -49,7 +50,7 @@ Report = Callable[[float, str], None]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A session at a glance (`glance.Glance` has the meanings), with what people said of it.
+    """A session at a glance (`scan.Scan` has the meanings), with what people said of it.
 
     start_ns: begin_ns as UTC, end_utc_ns: end_ns. run, files: words of Run and Files. state_text, lacks: in words.
     segments_json: those of `segments`, which a list does not show and so need not be read.
@@ -99,8 +100,10 @@ class Entry:
         return next((copy.to for copy in reversed(self.copies) if copy.contents == self.contents), "")
 
 
-def entry_of(seen: Glance, contents: str = "") -> Entry:
+def entry_of(seen: Scan, contents: str = "") -> Entry:
     """What a list shows of a session that was looked at."""
+    from thermostand.recording.reading.run_word import Files
+
     said = read_notes(seen.path)
     return Entry(
         seen.path,
@@ -113,13 +116,13 @@ def entry_of(seen: Glance, contents: str = "") -> Entry:
         None if seen.begin_ns is None else seen.utc.utc_ns(seen.begin_ns),
         None if seen.end_ns is None else seen.utc.utc_ns(seen.end_ns),
         str(seen.run),
-        str(seen.state),
+        str(seen.files),
         seen.state_text,
         seen.lacks,
         seen.has_camera_degC,
-        json.dumps([(file.name, str(file.state), file.size_bytes) for file in seen.files]),
-        seen.troubles,
-        seen.missing,
+        json.dumps([(file.name, str(file.state), file.size_bytes) for file in seen.inventory]),
+        seen.sentences(Files.DAMAGED),
+        seen.sentences(Files.INCOMPLETE),
         contents or contents_of(seen.path),
         said.notes,
         said.tags,
@@ -152,9 +155,9 @@ def catalogue(folder: Path, report: Callable[[int], Report] | None = None, memor
 
 def look_at(path: Path) -> Entry:
     """The session in `path`, whatever an index says; SessionError when there is none."""
-    from thermostand.recording.reading.glance import glance  # takes half a second to import
+    from thermostand.recording.reading.scan import scan  # takes half a second to import
 
-    return entry_of(glance(path))
+    return entry_of(scan(path))
 
 
 def contents_of(path: Path) -> str:
@@ -197,7 +200,7 @@ def _files(path: Path) -> list[_File] | None:
     if not found:
         return None
     found.sort()
-    for name in (JOURNAL_NAME, NOTES_NAME):
+    for name in (JOURNAL_NAME, NOTES_NAME, MANIFEST_NAME):
         try:
             status = os.stat(f"{place}/{name}")
         except OSError:

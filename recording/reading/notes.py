@@ -19,7 +19,7 @@ from typing import cast
 
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.json_values import json_object
-from thermostand.recording.reading.journal_lines import damage_text, journal_lines, lines_of, mark_of, unended_text
+from thermostand.recording.format.journal_lines import damage_text, journal_lines, lines_of, mark_of, unended_text
 
 NOTES_NAME = "notes.jsonl"
 LONGEST_NOTE = 4000  # characters

@@ -24,7 +24,6 @@ from thermostand.foundation.errors import NotThere, SessionError
 from thermostand.foundation.items import Event, Item, Original, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
-from thermostand.recording.format.chain import Link, misplaced
 from thermostand.recording.format.damage import FileDamaged, naming
 from thermostand.recording.format.decoded_items import (
     RecordedImage,
@@ -35,8 +34,8 @@ from thermostand.recording.format.decoded_items import (
     stands_for_item,
     step_of,
 )
-from thermostand.recording.format.holes import Hole, holes_in
-from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.format.holes import Hole
+from thermostand.recording.format.inventory import State, inventory, misplaced
 from thermostand.recording.format.layout import (
     DEVICES,
     FINISHED,
@@ -44,28 +43,25 @@ from thermostand.recording.format.layout import (
     TELEMETRY,
     unknown_format,
 )
+from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.records import (
     FramePlace,
+    Head,
     Message,
-    MessageSpan,
     frame_places,
-    message_span,
     read_head,
     telemetry_messages,
 )
 from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
 from thermostand.recording.reading.columns import Column, TopicColumns
-from thermostand.recording.reading.contents import Contents
-from thermostand.recording.reading.ends import Coverage
-from thermostand.recording.reading.extent import extent_of
 from thermostand.recording.reading.frames_table import FramesTable, frames_table
-from thermostand.recording.reading.hole_finder import find_holes
-from thermostand.recording.reading.journal_lines import journal_facts
-from thermostand.recording.reading.run_word import Run, run_word
+from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.scan import Depth, Scan, frames_of_plan, scan
 
 T = TypeVar("T")
 _UNFINISHED = (State.UNFINISHED, State.RECORDING)
-_TOPICS_OF_HOLES = (messages.EVENT, messages.STEP)
+_MOST = 6  # holes in a sentence before the rest is only counted
+Say = Callable[[str], None]
 
 
 class Session:
@@ -87,7 +83,7 @@ class Session:
         self._attachments = head.attachments
         if text := unknown_format(self.metadata):
             raise SessionError(f"{path}: {text}")
-        self._salvaged: dict[Path, bool] = {}  # of the segments known to belong here: whether a salvage has made them
+        self._heads: dict[Path, Head] = {}  # of the segments that are known to belong here
         for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others
             with suppress(_Unreadable):  # it is reported when it is read
                 self._check(segment)
@@ -275,19 +271,15 @@ class Session:
         """The description of every frame, in order of time."""
         return [place.meta for place in self._places()]
 
-    @cached_property
-    def _spans(self) -> list[MessageSpan]:
-        return [message_span(path) for path in self._frames]
-
     @property
     def _frames_in_segments(self) -> list[int]:
         """How many frames each segment has: two messages are one."""
-        return [span.count // 2 for span in self._spans]
+        return [self._check(path).span.count // 2 for path in self._frames]
 
     @cached_property
     def _is_in_order(self) -> bool:
         """Whether each segment's frames are all later than those before: then one frame needs one segment's index."""
-        spans = [span for span in self._spans if span.count]
+        spans = [span for path in self._frames if (span := self._check(path).span).count]
         return all(earlier.last_ns <= later.first_ns for earlier, later in pairwise(spans))
 
     def _places(self) -> Iterator[FramePlace]:
@@ -317,47 +309,28 @@ class Session:
                 yield item
 
     @cached_property
+    def scanned(self) -> Scan:
+        """What is wrong with the session or missing, by its steps and frames. Reads the telemetry once."""
+        return scan(self.path, Depth.STEPS)
+
+    @property
     def holes(self) -> tuple[Hole, ...]:
-        """What of the session is not there, of the telemetry first; those that are excused make it no less whole. Reads
-        the telemetry once."""
-        contents = Contents()
-        for message in self._decoded(lambda channel: channel.topic in _TOPICS_OF_HOLES, lambda message: message):
-            contents.receive(message)
-        recorded = holes_in(self.metadata.get("holes", ""))
-        links = {f"{path.parent.name}/{path.name}": self._link(path) for path in self.segments}
-        journal, coverage = journal_facts(self.path), Coverage(inventory(self.path), links, recorded)
-        is_part = extent_of(self.metadata) is not None
-        return find_holes(coverage, contents, self.frame_metas(), journal, is_part=is_part)
+        """What of the session is not there, of the telemetry first; those that are excused make it no less whole.
+        SessionError when a segment cannot be read, for it may have had that."""
+        for finding in self.scanned.findings:
+            if finding.files is Files.DAMAGED and finding.where.endswith(FINISHED):
+                raise FileDamaged(f"{self.path}/{finding.sentence}")
+        return self.scanned.holes
 
-    def _link(self, segment: Path) -> Link:
-        span = message_span(segment)
-        return Link(
-            segment.parent.name,
-            _number_of(segment),
-            span.count,
-            span.first_ns,
-            span.last_ns,
-            self.is_salvaged(segment),
-        )
-
-    @cached_property
+    @property
     def run(self) -> Run:
         """How its run ended, as far as it is recorded."""
-        extent = extent_of(self.metadata)
-        if extent is not None:
-            return extent.run
-        is_recording = any(file.state is State.RECORDING for file in inventory(self.path))
-        return run_word(self.events(), journal_facts(self.path), is_recording=is_recording)
+        return self.scanned.run
 
-    def is_salvaged(self, segment: Path) -> bool:
-        """Whether a salvage has made this segment of what a killed recorder left."""
-        self._check(segment)
-        return self._salvaged[segment]
-
-    def _check(self, segment: Path) -> None:
-        """SessionError when the segment is not of this session, or not of this place in it."""
-        if segment in self._salvaged:
-            return
+    def _check(self, segment: Path) -> Head:
+        """Its head; SessionError when the segment is not of this session, or not of this place in it."""
+        if segment in self._heads:
+            return self._heads[segment]
         try:
             head = read_head(segment)
         except SessionError as error:
@@ -371,7 +344,8 @@ class Session:
         if head.place and misplaced(segment.parent.name, _number_of(segment), head.place, head.session):
             where = f"{head.place.get('series')}/{head.place.get('number')}{FINISHED}"
             raise SessionError(f"{segment}: was recorded as {where}; give it that name again, or move it away")
-        self._salvaged[segment] = bool(head.salvaged)
+        self._heads[segment] = head
+        return head
 
 
 def _number_of(segment: Path) -> int:
@@ -380,3 +354,43 @@ def _number_of(segment: Path) -> int:
 
 class _Unreadable(FileDamaged):
     """The head of a segment cannot be read."""
+
+
+def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
+    """The session in `path`; SessionError when something of it is missing or was never finished, unless `incomplete`
+    takes the sentence that says what. Frames that were never acknowledged, or that the recorder itself said it lost,
+    are not missing."""
+    session = Session.open(path)
+    check_whole(session, incomplete)
+    return session
+
+
+def check_whole(session: Session, incomplete: Say | None = None) -> None:
+    """As above, for a session that is open."""
+    path = session.path
+    _check_finished(path, incomplete)
+    missing = [hole.text(session.utc) for hole in session.holes if not hole.excused]
+    for finding in session.scanned.findings:
+        if finding.files is Files.DAMAGED and finding.where in ("", MANIFEST_NAME):
+            raise SessionError(f"{path}: {finding.sentence}; take the session from its archive")
+        if finding.files in (Files.INCOMPLETE, Files.UNKNOWN) and finding.where == MANIFEST_NAME:
+            missing.append(finding.sentence)
+    if not missing:
+        return
+    more = [f"{len(missing) - _MOST} more"] if len(missing) > _MOST else []
+    plan = frames_of_plan(session.scanned.planned, session.frame_count) if session.run is Run.COMPLETE else ""
+    sentence = f"{path}: is incomplete; missing: {'; '.join([*missing[:_MOST], *more])}{plan}"
+    if incomplete is None:
+        raise SessionError(f"{sentence}; use --incomplete to read the rest")
+    incomplete(f"{sentence}; only the rest is used")
+
+
+def _check_finished(path: Path, incomplete: Say | None) -> None:
+    """Segments that a killed recorder has left are not read: a salvage finishes them."""
+    left = [file.name for file in inventory(path) if file.state is State.UNFINISHED]
+    if not left:
+        return
+    sentence = f"{path}: {left[0]} {'is' if len(left) == 1 else f'and {len(left) - 1} more are'} not finished and"
+    if incomplete is None:
+        raise SessionError(f"{sentence} would be left out; `stand session salvage {path}` first")
+    incomplete(f"{sentence} left out; `stand session salvage {path}` recovers what is in it")

@@ -20,12 +20,13 @@ from itertools import chain, count
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.records import Channel
+from mcap.records import Attachment, Channel, Schema
 from mcap.writer import CompressionType
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import sync_folder
 from thermostand.recording.format.images import ZSTD_LEVEL
+from thermostand.recording.format.inventory import State, inventory
 from thermostand.recording.format.layout import (
     DAMAGED,
     FINISHED,
@@ -38,13 +39,128 @@ from thermostand.recording.format.layout import (
     UNFINISHED,
     segment_metadata,
 )
+from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.mcap_bytes import Source
+from thermostand.recording.reading.segment_check import check_segment
 from thermostand.recording.reading.walk import StoredMessage, Survey, stored_messages, survey
-from thermostand.recording.repair.opening import Opening, opening_of, segments_of
-from thermostand.recording.repair.segment_check import check_segment
 from thermostand.recording.writing.locks import lock
+from thermostand.recording.writing.manifest_file import complete_manifest
 from thermostand.recording.writing.mcap_writer import McapWriter
 from thermostand.recording.writing.segment import CHUNK_BYTES, FrameTable
+
+# What a salvaged copy begins with: the segment's own opening and, where that is damaged, its siblings'.
+#
+# Every segment of a session repeats the session's metadata and attachments, every segment of a series the schemas and
+# channels. A sibling is a segment of the same session directory that contradicts nothing that is known of the damaged
+# one: same session id, same attachments, same channels. Where no sibling helps, nothing is guessed.
+#
+# Metadata has no CRC. So the record `session` is voted on: the one that most segments have is taken, a finished
+# segment's vote before the own and the own before an unfinished one's when they are equally many.
+
+_GREATEST = 999_999_999  # a number beyond is none that a recorder has given
+SIBLINGS_PER_SERIES = 4  # enough for a vote, few enough for a night of hundreds
+SESSION_ID = "session_id"
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """Metadata `session`, attachments by name, schemas and channels by number."""
+
+    session: Mapping[str, str]
+    attachments: Mapping[str, Attachment]
+    schemas: Mapping[int, Schema]
+    channels: Mapping[int, Channel]
+
+    def knows(self, channel: int) -> bool:
+        """Whether messages of that channel can be delivered."""
+        return channel in self.channels and self.channels[channel].schema_id in self.schemas
+
+
+@dataclass(frozen=True, slots=True)
+class _Sibling:
+    path: Path
+    found: Survey
+
+
+def opening_of(path: Path, own: Survey) -> Opening | None:
+    """The opening for the segment at `path`, of which `own` proved itself; None when its session is not known."""
+    siblings = [sibling for sibling in _siblings(path) if _agree(own, sibling.found)]
+    session = _session(own, siblings)
+    if session is None:
+        return None
+    attachments = dict(own.attachments)
+    schemas, channels = own.schemas, own.channels
+    if not own.is_opening_whole:
+        for sibling in siblings:
+            attachments = sibling.found.attachments | attachments
+    if own.messages.keys() - own.channels.keys():
+        schemas, channels = _tables(own, [sibling.found for sibling in siblings if sibling.path.parent == path.parent])
+    return Opening(session, attachments, schemas, channels)
+
+
+def segments_of(series: Path) -> list[Path]:
+    """The finished and unfinished segments in a folder; none when there is no such folder."""
+    files = (file for file in inventory(series.parent) if file.series == series.name)
+    return [file.path for file in files if file.state is not State.DAMAGED and file.number <= _GREATEST]
+
+
+def _siblings(path: Path) -> Iterator[_Sibling]:
+    """The nearest other segments of the session, each read to its first chunk."""
+    number = _number(path)
+    for series in (path.parent.parent / TELEMETRY, path.parent.parent / FRAMES):
+        segments = [other for other in segments_of(series) if other != path]
+        segments.sort(key=lambda other: (abs(_number(other) - number), other.name))
+        for other in segments[:SIBLINGS_PER_SERIES]:
+            with suppress(OSError):  # what cannot be read does not help
+                yield _Sibling(other, _read_opening(other))
+
+
+def _number(path: Path) -> int:
+    return int(path.name.partition(".")[0])
+
+
+def _read_opening(path: Path) -> Survey:
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        return survey(Source(fd), to_first_chunk=True)
+    finally:
+        os.close(fd)
+
+
+def _identity(session: Mapping[str, str]) -> tuple[str, str]:
+    return session.get(SESSION_ID, ""), session.get("uid", "")
+
+
+def _agree(one: Survey, other: Survey) -> bool:
+    """Whether nothing that is known of both says that they are of different sessions."""
+    if one.session and other.session and _identity(one.session) != _identity(other.session):
+        return False
+    both = one.attachments.keys() & other.attachments.keys()
+    return all(one.attachments[name].data == other.attachments[name].data for name in both)
+
+
+def _session(own: Survey, siblings: list[_Sibling]) -> Mapping[str, str] | None:
+    """The session's metadata by vote; None when no segment has it, or the siblings are of several sessions."""
+    finished = [sibling.found.session for sibling in siblings if sibling.path.name.endswith(FINISHED)]
+    unfinished = [sibling.found.session for sibling in siblings if not sibling.path.name.endswith(FINISHED)]
+    votes = [session for session in (*finished, own.session, *unfinished) if session]
+    if len({_identity(session) for session in votes}) != 1:
+        return None
+    ((winner, _),) = Counter(tuple(session.items()) for session in votes).most_common(1)
+    return dict(winner)
+
+
+def _tables(own: Survey, siblings: Iterable[Survey]) -> tuple[Mapping[int, Schema], Mapping[int, Channel]]:
+    """Schemas and channels completed from the siblings of the series, if these are of one mind and do not contradict
+    the own; else the own."""
+    tables = [(sibling.schemas, sibling.channels) for sibling in siblings if sibling.channels]
+    if not tables or any(table != tables[0] for table in tables):
+        return own.schemas, own.channels
+    schemas, channels = tables[0]
+    if schemas | own.schemas != own.schemas | schemas or channels | own.channels != own.channels | channels:
+        return own.schemas, own.channels
+    return schemas | own.schemas, channels | own.channels
+
 
 # How much of the files of a salvage has been read.
 
@@ -108,7 +224,7 @@ def salvage_session(directory: Path, report: ReportShare = no_report) -> list[Sa
     folders = [directory / series for series in (TELEMETRY, FRAMES) if (directory / series).is_dir()]
     if not folders:
         raise SessionError(f"{directory}: not a session: it has neither {TELEMETRY} nor {FRAMES}")
-    return _salvage_folders(folders, True, report)
+    return [*_salvage_folders(folders, True, report), *_manifest_of(directory)]
 
 
 def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salvaged]:
@@ -116,7 +232,19 @@ def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salv
     as above."""
     left = {path.parent for pattern in (UNFINISHED, TEMPORARY) for path in root.glob(f"*/*/*{pattern}")}
     folders = [folder for folder in sorted(left, reverse=True) if folder.name in LEVELS]  # telemetry is first
-    return _salvage_folders(folders, False, report)
+    found = _salvage_folders(folders, False, report)
+    return [*found, *chain.from_iterable(_manifest_of(directory) for directory in sorted({f.parent for f in folders}))]
+
+
+def _manifest_of(directory: Path) -> Iterator[Salvaged]:
+    """`session.json` lists what has been salvaged; reported where it had to be made anew."""
+    files = inventory(directory)
+    if any(file.state is State.RECORDING for file in files) or all(file.state is State.DAMAGED for file in files):
+        return  # its recorder writes it, or there is nothing to list
+    path = directory / MANIFEST_NAME
+    with _refusing(path), suppress(SessionError):
+        if reason := complete_manifest(directory):
+            yield Salvaged(path, path, 0, 0, reason, None)
 
 
 def _salvage_folders(folders: Iterable[Path], finished_too: bool, report: ReportShare) -> list[Salvaged]:
@@ -419,6 +547,8 @@ def salvage_line(salvaged: Salvaged) -> str:
     source = "/".join(salvaged.source.absolute().parts[-3:])
     if salvaged.reason == BEING_RECORDED:
         return f"{source}: left alone, it is being recorded"
+    if salvaged.source.name == MANIFEST_NAME:
+        return f"{source}: made of the segments that are there ({salvaged.reason})"
     outcome = f"{salvaged.messages} messages in {salvaged.path.name}" if salvaged.path else "nothing could be recovered"
     lost = f", {salvaged.lost_bytes} bytes lost" if salvaged.lost_bytes else ""
     kept = f", the original is kept as {salvaged.kept.name}" if salvaged.kept else ""

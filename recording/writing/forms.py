@@ -11,7 +11,9 @@ from mcap.writer import CompressionType
 from thermostand.foundation.clock import seconds_ns
 from thermostand.recording.format import messages
 from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
+from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.manifest import Manifest
 from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.recording.writing.segment import SeriesForm, Topic
 
@@ -26,6 +28,12 @@ class SessionForm:
     attachments: Mapping[str, str]
     devices: Mapping[str, str]
     settings: RecordingSettings
+
+    def manifest(self) -> Manifest:
+        """What is known of the session when it begins."""
+        texts = {name: text_hash(text) for name, text in self.attachments.items()}
+        devices = {name: declared(name, kind) for name, kind in self.devices.items()}
+        return Manifest(dict(self.metadata), devices, texts)
 
     def frames(self) -> SeriesForm:
         """Of the frames: raw ones are chosen for speed."""
@@ -57,6 +65,15 @@ class SessionForm:
             reserve_bytes=TELEMETRY_RESERVE_BYTES,
             merge_chunks=True,
         )
+
+
+def declared(device: str, kind: str) -> dict[str, object]:
+    """What the manifest says of a device: its kind, and its channels, each with its units."""
+    channels: dict[str, str] = {}
+    for quantity in messages.KINDS[kind].quantities:
+        name = f"{device}.{quantity.name}"
+        channels[name] = f"{channels[name]} or {quantity.unit}" if name in channels else quantity.unit
+    return {"kind": kind, "channels": channels}
 
 
 def telemetry_topics(devices: Mapping[str, str]) -> tuple[Topic, ...]:

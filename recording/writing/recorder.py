@@ -21,16 +21,17 @@ from pathlib import Path
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.events import SEGMENT_GIVEN_UP, EventKind
+from thermostand.foundation.events import SEGMENT_GIVEN_UP, TELL_PLAN, EventKind
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
+from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.writing.disk import Disk
 from thermostand.recording.writing.forms import SessionForm
 from thermostand.recording.writing.frames import Frames
 from thermostand.recording.writing.homes import Beside, Homes
-from thermostand.recording.writing.recorder_settings import USUAL, RecordingSettings, SessionInfo
+from thermostand.recording.writing.recorder_settings import USUAL, RecordingSettings
 from thermostand.recording.writing.series import DiskSeries, open_series
 from thermostand.recording.writing.telemetry import Telemetry
 from thermostand.recording.writing.waiting import Waiting
@@ -79,6 +80,8 @@ class Recorder:
         self._homes = Homes(directory, tell)
         self._frames = Frames(settings, prepare, clock, self._waiting, self._homes)
         self._telemetry = Telemetry(directory, devices, settings, clock, self._waiting, self._homes, tell)
+        self._receivers = self._frames.receive, self._telemetry.receive, self._receive_plan
+        self._plan: dict[str, int] = {}  # that the manifest does not have yet
         self._finishing: asyncio.Future[None] | None = None
 
     @property
@@ -149,7 +152,7 @@ class Recorder:
         self._frames.begin(series[0])
         self._telemetry.begin(series[1])
         self._begun_ns = self._clock.now_ns()
-        receivers = self._frames.receive, self._telemetry.receive
+        receivers = self._receivers
         for item in earlier:
             for receive in receivers:
                 receive(item)
@@ -191,7 +194,7 @@ class Recorder:
             await self._left()
             raise
         await self._left()
-        for receive in (self._frames.receive, self._telemetry.receive):
+        for receive in self._receivers:
             self._hub.unsubscribe(receive)
         await self._finishing
 
@@ -210,7 +213,7 @@ class Recorder:
                 stack.callback(frames.lane.close)
                 stack.push_async_callback(telemetry.lane.call, telemetry.series.close)
                 stack.push_async_callback(frames.lane.call, frames.series.close)
-                stack.push_async_callback(telemetry.finish)
+                stack.push_async_callback(self._complete)
                 stack.callback(self._report)
                 stack.push_async_callback(frames.lane.call, frames.series.finish)
                 await frames.finish()
@@ -220,6 +223,22 @@ class Recorder:
                 f"frames and {telemetry.messages_waiting} messages waited to be saved; `stand session salvage` "
                 "completes it when the disk answers"
             ) from error
+
+    async def _complete(self) -> None:
+        await self._telemetry.finish()
+        await self._save_plan()
+        await self._telemetry.lane.call(self._telemetry.series.end)
+
+    def _receive_plan(self, item: Item) -> None:
+        """Keep what an event says of the plan for the manifest."""
+        if isinstance(item, Event) and item.kind in TELL_PLAN:
+            size = {name: item.data.get(name) for name in ("steps", "frames")}
+            self._plan = {name: count for name, count in size.items() if isinstance(count, int)}
+
+    async def _save_plan(self) -> None:
+        if plan := self._plan:
+            self._plan = {}
+            await self._telemetry.lane.call(self._telemetry.series.plan, plan)
 
     def tell(self, kind: EventKind, said: str) -> None:
         """An event of this kind with the next report; from any thread."""
@@ -235,6 +254,7 @@ class Recorder:
 
     async def _save_telemetry(self, _: int) -> None:
         await self._telemetry.save()
+        await self._save_plan()
         self._report()  # a disk that is nearly full: frames are lost until this is reported
 
     async def _report_on_tick(self, _: int) -> None:

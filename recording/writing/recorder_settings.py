@@ -1,55 +1,10 @@
-"""The settings of a recording: who records what, and how."""
+"""The settings of a recording: how it is recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, Self
+from dataclasses import dataclass
 
 from thermostand.recording.format.images import FrameEncoding
-from thermostand.recording.format.layout import FORMAT
-
-_NOT_EMPTY = ("uid", "extent", "holes")  # left out of the record when they are
-
-
-@dataclass(frozen=True, slots=True)
-class SessionInfo:
-    """Who recorded what with which; the metadata record `session` of every segment.
-
-    simulated: the devices were fakes, in real or virtual time. On a virtual clock `host` is not recorded: that run on
-    another machine is the same session.
-
-    format: of the files. extent: of a part that was cut out of a session, the range and how the run
-    ended, as JSON; holes: of a copy of a session that is not whole, what the original lacked (holes.py). uid:
-    of this session alone, in hex digits, also when another one of its second and recipe has the same `session_id`; on a
-    virtual clock it follows from the seed.
-    """
-
-    session_id: str
-    recipe: str
-    camera_serial: str
-    operator: str
-    software_version: str
-    clock_source: Literal["wall", "virtual"]
-    simulated: bool = False
-    host: str = ""
-    format: str = str(FORMAT)
-    extent: str = ""
-    holes: str = ""
-    uid: str = ""
-
-    def metadata(self) -> dict[str, str]:
-        """The fields as MCAP metadata."""
-        texts: dict[str, str] = {**asdict(self), "simulated": str(self.simulated).lower()}
-        if self.clock_source == "virtual":
-            del texts["host"]
-        return {name: text for name, text in texts.items() if text or name not in _NOT_EMPTY}
-
-    @classmethod
-    def of(cls, metadata: Mapping[str, str]) -> Self:
-        """The inverse: segments that are added to a session have its own record; a field it lacks is ""."""
-        known: dict[str, Any] = {field.name: metadata.get(field.name, "") for field in fields(cls)}
-        return cls(**{**known, "simulated": known["simulated"] == "true"})
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,10 +16,12 @@ from __future__ import annotations
 import ctypes
 import errno
 import fcntl
+import hashlib
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,6 +45,7 @@ from thermostand.recording.format.layout import (
     UNFINISHED,
     segment_metadata,
 )
+from thermostand.recording.format.manifest import Sealed
 from thermostand.recording.format.mcap_bytes import MESSAGE, RECORD, check_attachment, chunk_content, records, stream
 from thermostand.recording.format.messages import frame_table
 from thermostand.recording.writing.mcap_writer import McapWriter
@@ -115,6 +118,7 @@ class CommitSink:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self._reserve_bytes = reserve_bytes
         self.committed_bytes = 0
+        self._sha256 = hashlib.sha256()
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX)  # a reader that looks at the new file meanwhile lets go at once
             _reserve(self._fd, reserve_bytes)
@@ -134,6 +138,8 @@ class CommitSink:
         the error raised."""
         try:
             end_bytes = _write(self._fd, parts, self.committed_bytes)
+            for part in parts:  # while the disk works; a sink that fails is not used again
+                self._sha256.update(part)
             os.fdatasync(self._fd)
             if not os.fstat(self._fd).st_nlink:
                 raise FileNotFoundError(errno.ENOENT, "the file was removed while it was written")
@@ -142,6 +148,10 @@ class CommitSink:
                 self.settle()
             raise
         self.committed_bytes = end_bytes
+
+    def sealed(self, messages: Mapping[str, int]) -> Sealed:
+        """What has been committed, as a whole file."""
+        return Sealed(self.committed_bytes, self._sha256.hexdigest(), dict(messages))
 
     def settle(self) -> None:
         """Cut the file to its committed blocks and give back the reserve, durably. Until that has succeeded a block
@@ -197,6 +207,7 @@ class Segment:
         self._writer = McapWriter(form.compression, CHUNK_BYTES, form.level)
         self._table = FrameTable(self._writer)
         self._chunk_count = 0
+        self._messages: Counter[str] = Counter()  # by topic
         self._sink = CommitSink(self._part, _affordable_bytes(folder, form))
         try:
             sync_folder(folder)
@@ -242,6 +253,7 @@ class Segment:
                 channel = self._channels[record.topic] = self._late(record.topic)
             self._writer.add_message(channel, time_ns, published_ns, record.sequence, record.data)
             self._table.note(channel, record.data)
+            self._messages[record.topic] += 1
         self._writer.end_chunk()
         self._sink.append(self._writer.take())
         self._chunk_count += 1
@@ -261,7 +273,12 @@ class Segment:
         """What of the reserve is not used yet."""
         return self._sink.reserved_bytes
 
-    def finish(self) -> None:
+    @property
+    def name(self) -> str:
+        """Within the session, as it is called when it is finished."""
+        return f"{self._form.name}/{self._finished.name}"
+
+    def finish(self) -> Sealed:
         """Index, sync, rename: the segment is complete and stays so. It is locked until it has its final name."""
         self._table.write(self.begun_ns)
         self._writer.end_data()
@@ -270,21 +287,24 @@ class Segment:
         self._writer.finish()
         self._sink.append(self._writer.take())
         self._sink.settle()
-        if not (self._form.merge_chunks and self._chunk_count >= MANY_CHUNKS and self._merged()):
+        sealed = self._merged() if self._form.merge_chunks and self._chunk_count >= MANY_CHUNKS else None
+        if sealed is None:
             os.replace(self._part, self._finished)
             sync_folder(self._part.parent)
+            sealed = self._sink.sealed(self._messages)
         self._sink.close()
+        return sealed
 
-    def _merged(self) -> bool:
-        """Whether the finished segment is now the copy with large chunks; when the disk has no room for it, or gives
-        back other bytes than it took, the file stays as it was committed."""
+    def _merged(self) -> Sealed | None:
+        """The finished segment when it is now the copy with large chunks; None when the disk has no room for it, or
+        gives back other bytes than it took: the file stays as it was committed."""
         try:
-            merge_chunks(self._part, self._finished, self._form.compression)
+            copy = merge_chunks(self._part, self._finished, self._form.compression)
         except DAMAGE:
-            return False
+            return None
         with suppress(OSError):  # the finished one counts where both are
             self._part.unlink()
-        return True
+        return replace(copy, messages=dict(self._messages))
 
     def abandon(self) -> None:
         """Let go after an error: what was committed stays as `.part`; a file without a message is removed. OSError
@@ -313,8 +333,9 @@ def _affordable_bytes(folder: Path, form: SeriesForm) -> int:
     return min(form.reserve_bytes, max(0, spare_bytes))
 
 
-def merge_chunks(source: Path, target: Path, compression: CompressionType) -> None:
-    """Copy the complete segment `source` to `target`, durably, with large chunks: a reader pays for every chunk.
+def merge_chunks(source: Path, target: Path, compression: CompressionType) -> Sealed:
+    """Copy the complete segment `source` to `target`, durably, with large chunks: a reader pays for every chunk. The
+    copy, its messages not counted.
 
     Telemetry is committed each second, so ten minutes are 600 chunks of a few messages each. The copy has the same
     header, attachments, metadata, schemas, channels and messages in the same order, and the same input gives the same
@@ -337,6 +358,7 @@ def merge_chunks(source: Path, target: Path, compression: CompressionType) -> No
     finally:
         sink.close()
     sync_folder(target.parent)
+    return sink.sealed({})
 
 
 def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -13,11 +13,13 @@ from typing import Any, NamedTuple, TypeVar
 
 from thermostand.foundation.files import make_durable_folder, sync_folder
 from thermostand.foundation.items import Event
-from thermostand.recording.format.chain import foreign_numbers
+from thermostand.recording.format.inventory import foreign_numbers
 from thermostand.recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
+from thermostand.recording.format.manifest import Sealed
 from thermostand.recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
 from thermostand.recording.writing.forms import SessionForm
 from thermostand.recording.writing.home import Home
+from thermostand.recording.writing.manifest_file import ManifestFile
 from thermostand.recording.writing.notices import SpaceWatch
 from thermostand.recording.writing.segment import CommitSink, Record, Segment, SeriesForm
 
@@ -33,9 +35,10 @@ class Series:
     raises FolderLost.
     """
 
-    def __init__(self, folder: Path, form: SeriesForm) -> None:
+    def __init__(self, folder: Path, form: SeriesForm, seal: Callable[[str, Sealed], None] | None = None) -> None:
         self._folder = folder
         self._form = form
+        self._seal = seal or _unlisted  # called with each finished segment
         self._home = Home(folder)
         self._used = -1  # the highest number that a message was committed under; it is never used again
         self._segment: Segment | None = None
@@ -144,7 +147,7 @@ class Series:
         try:
             self._let_go()
             if segment is not None:
-                segment.finish()
+                self._seal(segment.name, segment.finish())
         except OSError as error:
             self.troubles.append(f"a segment of {self._form.name} stays unfinished ({error})")
             self._close(segment)
@@ -159,6 +162,10 @@ class Series:
                 with suppress(OSError):
                     segment.abandon()
                 segment.close()
+
+
+def _unlisted(name: str, sealed: Sealed) -> None:
+    """Of a series without a session around it."""
 
 
 def next_number(folder: Path) -> int:
@@ -196,7 +203,9 @@ class SessionSeries:
             make_durable_folder(directory / name)
         sync_folder(directory)
         sync_folder(directory.parent)
-        frames, telemetry = Series(directory / FRAMES, form.frames()), Series(directory / TELEMETRY, form.telemetry())
+        self._manifest = ManifestFile(directory, form.manifest())
+        frames = Series(directory / FRAMES, form.frames(), self._manifest.seal)
+        telemetry = Series(directory / TELEMETRY, form.telemetry(), self._manifest.seal)
         self._series = {FRAMES: frames, TELEMETRY: telemetry}
         self._notices: deque[Event] = deque()
         stop, alert = form.settings.stop_frames_below_bytes, form.settings.alert_below_fraction
@@ -211,6 +220,14 @@ class SessionSeries:
         except OSError as error:
             failure = error
         return Done(result, failure, series.is_open, _taken(series.troubles))
+
+    def plan(self, size: Mapping[str, int]) -> None:
+        """How many `steps` and `frames` the plan has."""
+        self._manifest.plan(size)
+
+    def end(self) -> None:
+        """Everything that was recorded is in finished segments: the manifest says so, with the journal as it is now."""
+        self._manifest.end()
 
     def check_space(self) -> SpaceFound:
         """A look at the disk."""
@@ -286,6 +303,16 @@ class DiskSeries:
             self.is_open = False
             self.troubles.append(f"a segment of {self._name} stays unfinished ({error})")
             return False
+
+    def plan(self, size: Mapping[str, int]) -> None:
+        """See SessionSeries.plan; a process that has ended writes nothing."""
+        with suppress(OSError):
+            self._ask("plan", dict(size))
+
+    def end(self) -> None:
+        """See SessionSeries.end."""
+        with suppress(OSError):
+            self._ask("end")
 
     def close(self) -> None:
         """Let go of the folder; a process that has ended has."""

@@ -27,12 +27,12 @@ from thermostand.foundation.items import Item
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.tasks import cancelled
 from thermostand.recording.exporting.archive import DELETED
+from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.reading.notes import read_notes
 from thermostand.recording.reading.run_word import Run
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.disk import Disk
 from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
-from thermostand.recording.writing.recorder_settings import SessionInfo
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.running.session_files import info_of, recorder_in, tell_identities
 

@@ -20,13 +20,13 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import PLAN_CHANGED, RUN_BEGINS, RUN_END
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.progress import late_progress
+from thermostand.recording.format.journal_lines import text_hash
+from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.format.restarts import frames_lost_of, restarted_step
-from thermostand.recording.reading.glance import glance
-from thermostand.recording.reading.journal_lines import text_hash
 from thermostand.recording.reading.run_word import Run, last_run_event
+from thermostand.recording.reading.scan import scan
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
-from thermostand.recording.writing.recorder_settings import SessionInfo
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.executing.actions import cold_start
 from thermostand.stand.running.executing.camera_gap import CameraBefore, camera_before
@@ -138,7 +138,7 @@ def _interruption(
     all_entries = (*with_recorded(entries, items, _recorded_frames(session, plan)), *lost)
     info = SessionInfo.of(session.metadata)
     config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
-    last_ns = max(entries[-1].time_ns, glance(directory).end_ns or 0)
+    last_ns = max(entries[-1].time_ns, scan(directory).end_ns or 0)
     return Interruption(
         directory,
         replace(order, config=config),

@@ -2,7 +2,7 @@
 
 import shutil
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,11 @@ from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
 from thermostand.recording.format.images import frame_topics
+from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
+from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, read_manifest
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
+from thermostand.recording.writing.manifest_file import complete_manifest
 from thermostand.recording.writing.segment import Record, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import BatchEncoder
@@ -111,11 +114,28 @@ def write_segment(folder, series, indices, finish=False, **changes):
     data = part.read_bytes()
     recording.finish()
     finished = folder / part.name.removesuffix(".part")
-    if finish:
-        return Written(series, finished.read_bytes(), tuple(blocks))
-    finished.unlink()
-    part.write_bytes(data)
-    return Written(series, data, tuple(blocks))
+    if not finish:
+        finished.unlink()
+        part.write_bytes(data)
+    list_segments(folder.parent, changes)
+    return Written(series, finished.read_bytes() if finish else data, tuple(blocks))
+
+
+def list_segments(directory, changes):
+    """The session's manifest, as its recorder would have begun it, with the finished segments."""
+    texts = {name: text_hash(text) for name, text in changes.get("attachments", ATTACHMENTS).items()}
+    if not (directory / MANIFEST_NAME).exists():
+        begun = Manifest(changes.get("metadata", METADATA), texts=texts)
+        (directory / MANIFEST_NAME).write_bytes(begun.encoded())
+    complete_manifest(directory)
+
+
+def unlist(path):
+    """Take a segment out of its session's manifest, as when its recorder was killed before it was finished."""
+    directory = path.parent.parent
+    listed = read_manifest(directory)
+    segments = {name: each for name, each in listed.segments.items() if name != f"{path.parent.name}/{path.name[:9]}"}
+    (directory / MANIFEST_NAME).write_bytes(replace(listed, segments=segments, ended=False).encoded())
 
 
 def read_segment(path):

@@ -4,7 +4,7 @@ import json
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Event, StepMark, StepState
-from thermostand.recording.reading.journal_lines import JOURNAL_NAME, journal_lines, mark_of
+from thermostand.recording.format.journal_lines import JOURNAL_NAME, journal_lines, mark_of
 
 from .recorded import START_NS, half_second, record
 

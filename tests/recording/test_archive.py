@@ -14,7 +14,7 @@ from thermostand.recording.exporting import archive as module
 from thermostand.recording.exporting.archive import MANIFEST, Rule, archive, check_copy, delete, unfit
 from thermostand.recording.reading.catalogue import look_at
 from thermostand.recording.reading.notes import add_note, add_tags, read_notes
-from thermostand.recording.repair.verify import verify
+from thermostand.recording.reading.scan import verify
 
 DAY_NS = 86_400 * 10**9
 

@@ -23,9 +23,9 @@ from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
 from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.repair.verify import verify
 from thermostand.recording.writing.forms import telemetry_topics
 from thermostand.recording.writing.segment import SeriesForm
 from thermostand.recording.writing.series import Series

@@ -17,15 +17,13 @@ from thermostand.recording.format.holes import Hole, holes_in, holes_text
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.messages import TABLE_POSE
 from thermostand.recording.format.summary import read_summary
-from thermostand.recording.reading.glance import glance
 from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.run_word import Files, Run
-from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.using import open_whole
+from thermostand.recording.reading.scan import scan, verify
+from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.repair.verify import verify
 
-from .damage import METADATA, write_segment
+from .damage import METADATA, unlist, write_segment
 from .recorded import START_NS, images, record, telemetry
 from .runs import SECONDS, ended, entries, half_done, killed, record_run, remove, write_journal
 
@@ -51,8 +49,8 @@ def last_numbers(directory, series, count):
 def words(directory):
     """Run and files, on which list, info and verify agree."""
     found = verify(directory)
-    assert (glance(directory).run, glance(directory).state) == (found.run, found.files)
-    assert (overview(directory).glance.run, overview(directory).state) == (found.run, found.files)
+    assert (scan(directory).run, scan(directory).files) == (found.run, found.files)
+    assert (overview(directory).scanned.run, overview(directory).scanned.files) == (found.run, found.files)
     assert found.is_sound == (found.files is Files.SOUND)
     return found.run, found.files
 
@@ -86,6 +84,7 @@ def test_a_lost_tail_of_both_series_is_incomplete(session):
         "error: telemetry/0004.mcap: is missing, with all that followed: journal.jsonl says that the run ended at "
         "2026-01-01 18:00:20 UTC, the telemetry stops at 2026-01-01 18:00:14 UTC; "
         "12 of the 20 frames of the plan are there",
+        "error: frames/0003.mcap: is missing: session.json lists 2 segments more",
         "error: 3 frames of capture-12 to capture-14, 2026-01-01 18:00:12 to 2026-01-01 18:00:14 UTC: "
         "missing, though their steps are done",
     ]
@@ -161,14 +160,14 @@ async def test_steps_are_counted_against_the_plan(tmp_path):
     directory = await record_run(tmp_path / "s", items=half_done, status="")
     write_journal(directory, *entries(SECONDS // 2, "stopped"))
     found = overview(directory)
-    assert (found.glance.run, found.planned_steps) == (Run.STOPPED, SECONDS)
+    assert (found.scanned.run, found.planned_steps) == (Run.STOPPED, SECONDS)
     assert [step.state for step in found.steps].count(StepState.DONE) == SECONDS // 2
 
 
 def test_a_gap_is_reported_with_its_times_and_its_frames(session):
     remove(session, TELEMETRY, 1, 2)
     remove(session, FRAMES, 1)
-    assert verify(session).files is glance(session).state is Files.INCOMPLETE
+    assert verify(session).files is scan(session).files is Files.INCOMPLETE
     assert refused(session) == (
         f"{session}: is incomplete; missing: telemetry/0001.mcap to 0002.mcap (from 2026-01-01 18:00:02 to "
         "2026-01-01 18:00:11 UTC); "
@@ -184,7 +183,7 @@ def test_a_segment_of_a_huge_number_costs_nothing(session):
     assert time.perf_counter() - begun_s < 10
     assert any("telemetry/99999999999.mcap: is foreign: no segment of this session" in text for text in found)
     assert not any("is missing" in text for text in found)
-    assert glance(session).state is Files.DAMAGED
+    assert scan(session).files is Files.DAMAGED
 
 
 @pytest.mark.parametrize("series", [TELEMETRY, FRAMES])
@@ -193,14 +192,14 @@ def test_doubled_and_swapped_segments_are_refused_and_damaged(session, series):
     shutil.copy(first, doubled)
     with pytest.raises(SessionError, match=rf"{series}/0007.mcap: was recorded as {series}/0001.mcap"):
         Session.open(session)
-    assert (verify(session).files, glance(session).state) == (Files.DAMAGED, Files.DAMAGED)
+    assert (verify(session).files, scan(session).files) == (Files.DAMAGED, Files.DAMAGED)
     doubled.unlink()
     first.rename(doubled)
     second.rename(first)
     doubled.rename(second)
     with pytest.raises(SessionError, match=rf"{series}/0001.mcap: was recorded as {series}/0002.mcap"):
         Session.open(session)
-    assert (verify(session).files, glance(session).state) == (Files.DAMAGED, Files.DAMAGED)
+    assert (verify(session).files, scan(session).files) == (Files.DAMAGED, Files.DAMAGED)
 
 
 async def test_frames_of_another_session_are_refused_by_everything_that_uses_them(session, tmp_path):
@@ -210,7 +209,7 @@ async def test_frames_of_another_session_are_refused_by_everything_that_uses_the
         export(Session.open(session), tmp_path / "out", report=lambda done, text: None)
     with pytest.raises(SessionError, match=r"frames/0001\.mcap: "):
         trim(Session.open(session), tmp_path / "part", START_NS, START_NS + NS_PER_S)
-    assert (verify(session).files, glance(session).state) == (Files.DAMAGED, Files.DAMAGED)
+    assert (verify(session).files, scan(session).files) == (Files.DAMAGED, Files.DAMAGED)
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "part").exists()
 
@@ -270,6 +269,7 @@ async def test_what_a_kill_cost_is_no_hole_and_its_copies_are_sound(tmp_path):
         *_, chunk = read_summary(file, last.stat().st_size).chunks()
     last.with_name(f"{last.name}.part").write_bytes(last.read_bytes()[: chunk.offset + 30])
     last.unlink()
+    unlist(last)
     assert words(directory) == (Run.INTERRUPTED, Files.INCOMPLETE)
     salvage_session(directory)
     write_journal(directory, *entries(16, ""))
@@ -299,13 +299,13 @@ def test_a_session_of_an_earlier_format_is_refused_with_a_sentence(session, form
     everywhere(session, format=format_text)
     with pytest.raises(SessionError, match="was recorded by an earlier, unreleased version of thermostand"):
         Session.open(session)
-    assert verify(session).files is glance(session).state is Files.UNKNOWN
+    assert verify(session).files is scan(session).files is Files.UNKNOWN
 
 
 def test_of_a_later_format_it_is_unknown_whether_everything_is_there(session):
     everywhere(session, format="4")
-    found, seen = verify(session), glance(session)
-    assert found.files is seen.state is Files.UNKNOWN
+    found, seen = verify(session), scan(session)
+    assert found.files is seen.files is Files.UNKNOWN
     assert not found.is_sound
     assert "is of format '4'; this version of thermostand reads up to 3" in seen.state_text
     assert "what that format adds was not checked" in str(found.findings[0])
@@ -314,7 +314,7 @@ def test_of_a_later_format_it_is_unknown_whether_everything_is_there(session):
 def test_a_field_that_this_version_does_not_know_is_named(session):
     everywhere(session, weather="fog")
     found = verify(session)
-    assert found.files is glance(session).state is Files.SOUND
+    assert found.files is scan(session).files is Files.SOUND
     assert any("fields that this version does not know: weather" in finding.text for finding in found.findings)
 
 

@@ -12,9 +12,9 @@ from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.format.mcap_bytes import Source, chunk_content, records
 from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.walk import stored_messages, survey
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.repair.verify import verify
 
 RECORDS = struct.pack("<BQ", 3, 5) + b"hello" + struct.pack("<BQ", 4, 0)
 

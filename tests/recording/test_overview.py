@@ -13,8 +13,8 @@ from thermostand.foundation.instants import date_time, duration, parse_instant, 
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading, bad_reading
 from thermostand.recording.format.inventory import State, inventory
-from thermostand.recording.reading.glance import glance
 from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.scan import scan
 
 from .recorded import ATTACHMENTS, START_NS, record
 
@@ -58,9 +58,9 @@ async def session(tmp_path):
 
 
 async def test_a_glance_tells_what_when_and_how_much(session):
-    seen = glance(session)
-    files = [path for path in session.rglob("*") if path.is_file()]
-    assert (seen.frames, seen.state, seen.simulated) == (5, "sound", False)
+    seen = scan(session)
+    files = list(session.rglob("*.mcap"))
+    assert (seen.frames, seen.files, seen.simulated) == (5, "sound", False)
     assert (seen.begin_ns, seen.end_ns) == (START_NS, START_NS + 9 * NS_PER_S)
     assert seen.size_bytes == sum(path.stat().st_size for path in files)
     assert seen.metadata["recipe"] == "thermal_cycle"
@@ -91,7 +91,7 @@ async def test_the_overview_has_frames_temperatures_and_events(session):
     assert air.mean_degC == pytest.approx((sum(range(20, 30)) - 22) / 9)
     assert (camera.channel, camera.count, camera.bad) == ("camera.temperature", 10, 10)
     assert math.isnan(camera.mean_degC)
-    assert found.gaps == found.troubles == ()
+    assert found.gaps == found.scanned.findings == ()
     assert [event.kind for event in found.events] == ["device_lost", "run.end"]
     assert found.ending is not None
     assert found.ending.text == "aborted: stopped by the operator"
@@ -100,10 +100,9 @@ async def test_the_overview_has_frames_temperatures_and_events(session):
 async def test_a_damaged_segment_is_reported_and_the_others_are_read(session):
     path = session / "telemetry" / "0001.mcap"
     path.write_bytes(path.read_bytes()[:-20])
-    assert glance(session).state_text.startswith("damaged: telemetry/0001.mcap: ")
+    assert scan(session).state_text.startswith("damaged: telemetry/0001.mcap: ")
     found = overview(session)
-    assert [trouble.startswith("telemetry/0001.mcap: ") for trouble in found.troubles] == [True] * len(found.troubles)
-    assert found.troubles
+    assert {each.where for each in found.scanned.findings} == {"telemetry/0001.mcap"}
     assert 5 <= found.temperatures[1].count < 10
     assert found.frames.count == 5
 
@@ -111,9 +110,9 @@ async def test_a_damaged_segment_is_reported_and_the_others_are_read(session):
 async def test_a_recording_without_a_finished_segment_still_tells_what_it_is(session):
     for path in session.rglob("*.mcap"):
         path.rename(path.with_name(f"{path.name}.part"))
-    seen = glance(session)
+    seen = scan(session)
     assert seen.metadata["recipe"] == "thermal_cycle"
-    assert seen.state_text.startswith(f"incomplete: {len(seen.files)} segments not finished")
+    assert (seen.files, len(seen.sentences(seen.files))) == ("incomplete", len(seen.inventory))
     assert (seen.frames, seen.begin_ns, seen.end_ns) == (0, None, None)
     assert overview(session).steps == ()
 
@@ -122,12 +121,12 @@ async def test_a_session_without_telemetry_is_not_complete(session):
     for path in (session / "telemetry").iterdir():
         path.rename(path.with_name(f"{path.name}.damaged"))
     kept = len(list((session / "telemetry").iterdir()))
-    assert glance(session).state_text == (
-        "damaged: telemetry/0000.mcap.damaged: is an original that a salvage could not recover completely "
-        f"and {kept - 1} more"
+    assert scan(session).state_text == (
+        "damaged: telemetry/0000.mcap.damaged: is an original that a salvage kept because it could not recover all of "
+        f"it and {kept - 1} more"
     )
     shutil.rmtree(session / "telemetry")
-    assert glance(session).state_text == "incomplete: telemetry is missing"
+    assert scan(session).state_text == "incomplete: telemetry: is missing"
     assert overview(session).frames.count == 5
 
 
@@ -146,19 +145,19 @@ async def test_frames_that_the_recorder_lost_are_counted_apart_from_those_that_n
 async def test_what_a_salvage_kept_and_what_is_no_segment(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
     (session / "frames" / "notes.txt").write_text("a cloudy night")
-    assert glance(session).state_text == (
-        "damaged: frames/0000.2.mcap.damaged: is an original that a salvage could not recover completely"
+    assert scan(session).state_text == (
+        "damaged: frames/0000.2.mcap.damaged: is an original that a salvage kept because it could not recover all of it"
     )
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 async def test_a_segment_that_may_not_be_opened_hides_no_other(session):
-    before = glance(session)
+    before = scan(session)
     part = session / "telemetry" / "0009.mcap.part"
     part.write_bytes(b"")
     part.chmod(0)
-    assert glance(session).state_text == "incomplete: 1 segment not finished"
-    assert [file for file in inventory(session) if file.path != part] == list(before.files)
+    assert scan(session).state_text.startswith("incomplete: telemetry/0009.mcap.part: is not finished")
+    assert [file for file in inventory(session) if file.path != part] == list(before.inventory)
 
 
 def test_a_segment_that_is_given_another_name_meanwhile_hides_no_other(tmp_path):
@@ -196,7 +195,7 @@ async def test_a_look_leaves_no_lock(session):
 def test_a_folder_without_segments_is_no_session(tmp_path):
     (tmp_path / "telemetry").mkdir()
     with pytest.raises(SessionError, match="not a session"):
-        glance(tmp_path)
+        scan(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,13 @@ from tests.stand.hostile_sessions import everywhere, rewritten
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark
 from thermostand.foundation.readings import Frame
+from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
-from thermostand.recording.reading.glance import glance
-from thermostand.recording.reading.journal_lines import text_hash
+from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.reading.run_word import Files
-from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.using import open_whole
+from thermostand.recording.reading.scan import scan, verify
+from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.repair.verify import verify
-from thermostand.recording.writing.recorder_settings import SessionInfo
 
 
 @pytest.fixture
@@ -30,7 +28,7 @@ async def session(tmp_path):
 def words(directory):
     """What list and verify say of its files."""
     found = verify(directory).files
-    assert glance(directory).state is found
+    assert scan(directory).files is found
     return found
 
 

@@ -22,6 +22,7 @@ from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.recording.format.manifest import MANIFEST_NAME, read_manifest
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, Saved
 
@@ -63,7 +64,7 @@ async def test_the_same_items_are_the_same_bytes_on_any_host(tmp_path):
     await record(tmp_path / "a", 4, info=replace(INFO, host="laboratory"))
     await record(tmp_path / "b", 4, info=replace(INFO, host="laptop"))
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    assert sorted(contents(tmp_path / "a")) == ["frames/0000.mcap", "telemetry/0000.mcap"]
+    assert sorted(contents(tmp_path / "a")) == ["frames/0000.mcap", "session.json", "telemetry/0000.mcap"]
     await record(tmp_path / "c", 4, info=replace(INFO, clock_source="wall", host="laboratory"))
     assert contents(tmp_path / "c") != contents(tmp_path / "a")
 
@@ -119,7 +120,9 @@ async def test_raw_frames_are_read_back(tmp_path):
 async def test_a_second_run_continues_the_session(tmp_path):
     await record(tmp_path / "s", 2)
     await record(tmp_path / "s", 2)
-    assert sorted(contents(tmp_path / "s")) == [f"{s}/000{k}.mcap" for s in ("frames", "telemetry") for k in (0, 1)]
+    names = [f"{series}/000{number}.mcap" for series in ("frames", "telemetry") for number in (0, 1)]
+    assert sorted(contents(tmp_path / "s")) == sorted([*names, MANIFEST_NAME])
+    assert sorted(read_manifest(tmp_path / "s").segments) == names
     assert Session.open(tmp_path / "s").frame_count == 4
 
 

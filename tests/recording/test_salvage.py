@@ -19,9 +19,9 @@ from tests.recording.damage import (
 )
 from thermostand.recording.format.layout import FRAMES, TELEMETRY, segment_metadata
 from thermostand.recording.format.records import read_head
+from thermostand.recording.reading.scan import Severity, verify
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_line, salvage_session
-from thermostand.recording.repair.verify import Severity, verify
 
 TRIALS = [15, by_night(1000)]
 """Places at which a file is damaged, by day and by night."""

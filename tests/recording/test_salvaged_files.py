@@ -183,14 +183,15 @@ TORN, DAMAGED = (lambda data: data[:-60]), hole(9000, 9500)
 PLACED = ["replace", "sync_folder"]
 KEPT = ["link", "sync_folder"]
 GONE = ["unlink", "sync_folder"]
+LISTED = ["fsync", *PLACED]
 
 
 @pytest.mark.parametrize(
     ("which", "change", "steps"),
     [
-        ("part", TORN, ["fsync", *PLACED, *GONE]),
-        ("part", DAMAGED, ["fsync", *KEPT, *PLACED, *GONE]),
-        ("finished", DAMAGED, ["fsync", *KEPT, *PLACED]),
+        ("part", TORN, ["fsync", *PLACED, *GONE, *LISTED]),
+        ("part", DAMAGED, ["fsync", *KEPT, *PLACED, *GONE, *LISTED]),
+        ("finished", DAMAGED, ["fsync", *KEPT, *PLACED, *LISTED]),
         ("part", lambda data: b"", GONE),
     ],
     ids=["torn", "damaged", "finished and damaged", "empty"],
@@ -248,7 +249,7 @@ def test_what_a_dead_recorder_had_reserved_is_room_for_the_copy(tmp_path, night)
         sink = CommitSink(disk / "night" / FRAMES / "0000.mcap.part", disk_bytes - 20_000)
         sink.append([data])
         sink.close()
-        (done,) = salvage_unfinished(disk)
+        done, _ = salvage_unfinished(disk)
         assert read_segment(done.path) == night[1][FRAMES, "part"].messages
 
 
@@ -274,7 +275,7 @@ def test_an_attached_recording_is_not_taken_for_this_one(tmp_path, night, place)
     begin = write_with_attachment(part, night[1][TELEMETRY, "finished"].data)
     if place is not None:
         part.write_bytes(hole(begin + place, begin + place + 8)(part.read_bytes()))
-    (done,) = salvage_session(tmp_path)
+    done = salvage_session(tmp_path)[0]
     assert [record.topic for record in read_segment(done.path)] == ["/x"] * 50
 
 

@@ -8,8 +8,8 @@ import pytest
 from tests.recording.damage import names, read_segment, write_segment
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.repair.verify import verify
 
 SERIES = [TELEMETRY, FRAMES]
 COUNT = 20

@@ -14,10 +14,11 @@ from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format.inventory import inventory
 from thermostand.recording.format.records import frame_places
 from thermostand.recording.reading.gaps import silences
+from thermostand.recording.reading.scan import Severity, verify
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.repair.verify import Severity, verify
 
+from .damage import unlist
 from .recorded import item_key, record
 
 SECONDS = 12
@@ -60,7 +61,7 @@ def notes(directory):
 async def test_a_whole_session_is_sound_and_counted(session):
     done = []
     found = verify(session, lambda done_bytes, text: done.append((done_bytes, text)))
-    files = [path for path in session.rglob("*") if path.is_file()]
+    files = list(session.rglob("*.mcap"))
     assert found.findings == ()
     assert found.is_sound
     assert (found.segments, found.frames) == (len(files), SECONDS)
@@ -124,6 +125,7 @@ def tear(path, chunk):
         summary = SeekingReader(file).get_summary()
     path.with_name(f"{path.name}.part").write_bytes(data[: summary.chunk_indexes[-chunk].chunk_start_offset + 30])
     path.unlink()
+    unlist(path)
 
 
 def without_ends(time_ns, index):

@@ -12,6 +12,7 @@ import socket
 import struct
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,10 +20,13 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from thermostand.foundation.errors import SessionError
 from thermostand.recording.format import messages
+from thermostand.recording.format.journal_lines import journal_lines, lines_of
 from thermostand.recording.format.layout import FRAME_TABLE, FRAMES, TELEMETRY
+from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
-from thermostand.recording.reading.journal_lines import journal_lines, lines_of
+from thermostand.recording.writing.manifest_file import write_manifest
 
 SOUND, INCOMPLETE, DAMAGED, UNKNOWN, NONE = "sound", "incomplete", "damaged", "unknown", ""
 GB = 1 << 30
@@ -128,8 +132,16 @@ def false_heads(session: Path, size_bytes: int) -> None:
     (session / FRAMES / "0005.mcap.part").write_bytes(data)
 
 
-def rewritten(path: Path, attachments: dict[str, bytes] | None = None, behind=(), instead=None, **session: str) -> None:
-    """The segment with other attachments, metadata, messages behind its own ((topic, data), ...), or images instead."""
+def rewritten(
+    path: Path,
+    attachments: dict[str, bytes] | None = None,
+    behind=(),
+    instead=None,
+    relist: bool = True,
+    **session: str,
+) -> None:
+    """The segment with other attachments, metadata, messages behind its own ((topic, data), ...), or images instead.
+    relist: whoever does that makes a manifest of it as well."""
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -168,12 +180,23 @@ def rewritten(path: Path, attachments: dict[str, bytes] | None = None, behind=()
             writer.add_attachment(0, 0, FRAME_TABLE, "application/x-protobuf", data)
         writer.finish()
     new.replace(path)
+    if relist:
+        relisted(path.parent.parent)
 
 
-def everywhere(session: Path, **changes) -> None:
+def relisted(session: Path) -> None:
+    """With a manifest of what is there, where it has one and any of it can be read."""
+    with suppress(SessionError):
+        if (session / MANIFEST_NAME).exists():
+            write_manifest(session)
+
+
+def everywhere(session: Path, relist: bool = True, **changes) -> None:
     for series in (TELEMETRY, FRAMES):
         for path in sorted((session / series).glob("*.mcap")):
-            rewritten(path, **changes)
+            rewritten(path, relist=False, **changes)
+    if relist:
+        relisted(session)
 
 
 def configured(text: bytes) -> Callable[[Path], None]:
@@ -337,7 +360,7 @@ ROWS: dict[str, Row] = {
         configured("\n".join(f"k{n}: 1" for n in range(60_000)).encode()), SOUND, nightly=True
     ),
     "a deep configuration": Row(configured(DEEP.encode()), SOUND),
-    "a configuration that is not UTF-8": Row(configured(b"name: \xff\xfe\n"), SOUND),
+    "a configuration that is not UTF-8": Row(configured(b"name: \xff\xfe\n"), DAMAGED),
     "a configuration that is code": Row(configured(b"name: !!python/object/apply:os.system ['true']\n"), SOUND),
     "a deep event": Row(reported(event("note", "deep", DEEP)), DAMAGED),
     "an event of huge numbers": Row(reported(event("note", "huge", '{"x": %s}' % ("9" * 5000))), DAMAGED),

@@ -17,8 +17,8 @@ from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Reading
 from thermostand.recording.reading.notes import NOTES_NAME, add_tags
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.verify import verify
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.daemon.day_record import DayRecord, remove_idle_logs

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.journals import MARK, lines_with, read_lines
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.reading.journal_lines import journal_lines, lines_of
+from thermostand.recording.format.journal_lines import journal_lines, lines_of
 from thermostand.stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, decoded
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, taken_over
 

@@ -29,7 +29,7 @@ from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.errors import StandTripped
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.readings import Frame
-from thermostand.recording.reading.journal_lines import lines_of
+from thermostand.recording.format.journal_lines import lines_of
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from thermostand.stand.running.executing.actions import CREDITED_WITHIN_K

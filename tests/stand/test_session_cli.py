@@ -63,7 +63,10 @@ def test_the_list_has_a_line_for_each_session_and_for_a_damaged_one(session: Pat
     ]
     running, first, last = (line.split(maxsplit=8) for line in lines)  # the one without a known start is first
     assert (running[0], running[1]) == ("y-running", "thermal_cycle")
-    assert "interrupted  incomplete: 3 segments not finished and 1 more" in lines[0]
+    assert (
+        "interrupted  incomplete: frames/0000.mcap.part: is not finished; `stand session salvage` recovers what"
+        in lines[0]
+    )
     assert first[:6] == [session.name, "thermal_cycle", "2026-01-01", "18:00:00", "5.5", "s"]
     assert first[6] == "12"
     assert lines[1].endswith("real     interrupted  sound")

@@ -13,8 +13,8 @@ from tests.recording.recorded import START_NS, half_second, record
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import CLOCK_STEP
 from thermostand.foundation.items import Event
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.verify import verify
 from thermostand.stand.commands.sessions.session_commands import app
 
 HOUR_NS = 3600 * NS_PER_S

@@ -19,13 +19,11 @@ from tests.system.test_run import at_step, fault, ignore
 from tests.system.test_run_ends import SHORTER
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.items import StepState
-from thermostand.recording.reading.glance import glance
-from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.format.journal_lines import JOURNAL_NAME
 from thermostand.recording.reading.run_word import Files, Run
-from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.using import open_whole
+from thermostand.recording.reading.scan import scan, verify
+from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.repair.verify import verify
 from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.memory.entries import Tripped
 from thermostand.stand.running.order import Order
@@ -54,7 +52,7 @@ async def test_a_stopped_run_goes_on_without_the_first_line_of_its_journal_and_o
     with pytest.raises(Interrupted):
         await run_virtual(ordered, out, 7, at_step("capture", lambda: os.kill(os.getpid(), signal.SIGINT)))
     (directory,) = out.iterdir()
-    assert (glance(directory).run, verify(directory).files) == (Run.STOPPED, Files.SOUND)
+    assert (scan(directory).run, verify(directory).files) == (Run.STOPPED, Files.SOUND)
     count = flip(directory, 0, 2, -1)
     assert (verify(directory).run, verify(directory).files) == (Run.STOPPED, Files.DAMAGED)
     before = await asyncio.to_thread(interruption, directory)
@@ -76,7 +74,7 @@ async def test_a_run_whose_end_its_journal_has_lost_is_ended_by_the_recording(
     assert (verify(directory).run, verify(directory).files) == (Run.COMPLETE, Files.SOUND)
     copy = Path(shutil.copytree(directory, tmp_path / "copy"))
     flip(copy, -1)
-    assert (glance(copy).run, verify(copy).files) == (Run.COMPLETE, Files.DAMAGED)
+    assert (scan(copy).run, verify(copy).files) == (Run.COMPLETE, Files.DAMAGED)
     with pytest.raises(SessionError, match="its run is complete; there is nothing to resume"):
         await asyncio.to_thread(interruption, copy)
     info = [event.data for event in Session.open(directory).events() if event.kind == "run.start"]
@@ -95,11 +93,11 @@ def test_a_killed_run_is_interrupted_and_once_salvaged_its_files_are_sound(
     daemon.kill()
     asyncio.run(end_laboratory(ordered))
     (directory,) = (tmp_path / "out").iterdir()
-    assert (glance(directory).run, verify(directory).files) == (Run.INTERRUPTED, Files.INCOMPLETE)
+    assert (scan(directory).run, verify(directory).files) == (Run.INTERRUPTED, Files.INCOMPLETE)
     salvage_session(directory)
     found = verify(directory)
     assert (found.run, found.files) == (Run.INTERRUPTED, Files.SOUND), found.findings
-    assert (glance(directory).run, glance(directory).state) == (found.run, found.files)
+    assert (scan(directory).run, scan(directory).files) == (found.run, found.files)
     assert all(hole.excused for hole in open_whole(directory).holes)
 
 

@@ -29,9 +29,10 @@ from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.foundation.sealed import seal
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.reading.notes import add_note, add_tags, read_notes
 from thermostand.recording.writing.recorder import Recorder
-from thermostand.recording.writing.recorder_settings import RecordingSettings, SessionInfo
+from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.stand.chamber.compressor import CompressorState, keep, restored
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens

@@ -15,8 +15,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
 from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.verify import verify
 from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.executing.executor import Executor
 from thermostand.stand.running.order import Order

@@ -14,8 +14,8 @@ from tests import forked
 from tests.system.conftest import WHOLE_SENSOR, require_aravis
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.foundation.exit_codes import NOT_REPORTED
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.verify import verify
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.estimating.estimate import price

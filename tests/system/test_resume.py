@@ -22,10 +22,9 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import StepState
 from thermostand.recording.format.messages import FRAME_META_CLASS
 from thermostand.recording.format.restarts import begins_of, is_superseded
-from thermostand.recording.reading.glance import glance
 from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.verify import verify
 from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.memory.entries import Dwell, Gap, Step
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
@@ -98,7 +97,7 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
     assert (session.incomplete, session.damaged) == ((), ())
     found = verify(directory)
     assert (found.run, found.files) == (Run.COMPLETE, Files.SOUND), found.findings
-    assert (glance(directory).run, glance(directory).state) == (found.run, found.files)
+    assert (scan(directory).run, scan(directory).files) == (found.run, found.files)
     assert [hole for hole in session.holes if not hole.excused] == []
     done = Counter(mark.step_id for mark in session.steps() if mark.state is StepState.DONE)
     assert done == Counter(planned.step_id for planned in plan)

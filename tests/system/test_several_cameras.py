@@ -13,8 +13,8 @@ from tests.dialects import DIALECTS
 from tests.sections import change
 from thermostand.compensation.observations import observe
 from thermostand.foundation.documents import parse_document
+from thermostand.recording.reading.scan import Files, verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.verify import Files, verify
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.run import resume, run_virtual

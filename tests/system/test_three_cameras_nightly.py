@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from thermostand.recording.reading.scan import Files, verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.verify import Files, verify
 
 from .conftest import require_aravis
 from .test_several_cameras import recorded, simulated

@@ -28,12 +28,10 @@ from thermostand.recording.exporting.replay import ReplayClock, replay, replay_a
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format.damage import FileDamaged
 from thermostand.recording.format.inventory import State, inventory
-from thermostand.recording.reading.glance import Glance, glance
 from thermostand.recording.reading.overview import overview
-from thermostand.recording.reading.session import Session
-from thermostand.recording.reading.using import check_whole
+from thermostand.recording.reading.scan import Scan, scan, verify
+from thermostand.recording.reading.session import Session, check_whole
 from thermostand.recording.repair.salvage import Salvaged, salvage_line, salvage_session
-from thermostand.recording.repair.verify import verify
 from thermostand.stand.commands.sessions.session_args import (
     IncompleteOption,
     OutOption,
@@ -152,7 +150,7 @@ def replay_session(
     times = _speed(speed)
     if record is not None:
         _check_new(record, directory)
-    seen = glance(check_session(directory))
+    seen = scan(check_session(directory))
     with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session, record) as watch:
         if record is None:
             asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
@@ -179,7 +177,7 @@ def _check_new(out: Path, session: Path) -> None:
 
 
 @contextmanager
-def _replay_progress(seen: Glance, session: Session, record: Path | None) -> Generator[Callable[[Hub], None]]:
+def _replay_progress(seen: Scan, session: Session, record: Path | None) -> Generator[Callable[[Hub], None]]:
     """Progress in seconds of the session; its steps and events as lines, in local time or as JSON."""
     begin_ns, end_ns, utc = seen.begin_ns or 0, seen.end_ns or 0, session.utc
     with progress("replay", (end_ns - begin_ns) / NS_PER_S) as report:
@@ -257,13 +255,13 @@ def trim_session(
     Example: stand session trim sessions/20260101T180000Z-thermal-cycle --out part --from step:12 --to +5h
     """
     _check_new(out, directory)
-    seen = glance(check_session(directory))
+    seen = scan(check_session(directory))
     with _session_to_use(directory, incomplete) as session:
         part = trim(session, out, *_range(begin, end, session, seen))
         show({"session": part}, [part])
 
 
-def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple[int, int]:
+def _range(begin: str, end: str | None, session: Session, seen: Scan) -> tuple[int, int]:
     """From when up to when; ConfigError when that is not a time, or none."""
     begin_ns = _instant(begin, session, seen)
     if seen.end_ns is not None and begin_ns > seen.end_ns:
@@ -274,7 +272,7 @@ def _range(begin: str, end: str | None, session: Session, seen: Glance) -> tuple
     return begin_ns, end_ns
 
 
-def _instant(text: str, session: Session, seen: Glance) -> int:
+def _instant(text: str, session: Session, seen: Scan) -> int:
     """ns since the epoch; ConfigError when the text is no time, or names no step of the session."""
     step = re.fullmatch(r"step:(\d+)", text)
     if step is None:

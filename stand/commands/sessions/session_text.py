@@ -14,9 +14,9 @@ from thermostand.foundation.usage import one_line
 from thermostand.recording.format.inventory import State
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.catalogue import Entry, entry_of
-from thermostand.recording.reading.glance import Glance
-from thermostand.recording.reading.overview import Frames, Overview, Step, Temperature
-from thermostand.recording.repair.verify import Verification
+from thermostand.recording.reading.overview import FramesSummary, Overview, RunStep, TemperatureRange
+from thermostand.recording.reading.run_word import Files
+from thermostand.recording.reading.scan import Scan
 from thermostand.stand.commands.sessions.session_table import entry_json, size
 
 WIDTH = 100
@@ -26,7 +26,7 @@ _MOST = 20  # entries of a list before the rest is only counted
 
 def info_lines(found: Overview) -> Iterator[str]:
     """`stand session info`."""
-    utc = found.utc
+    utc = found.scanned.utc
     parts = (
         _facts(found, utc),
         _steps(found, utc),
@@ -42,7 +42,7 @@ def info_lines(found: Overview) -> Iterator[str]:
 
 def _entry(found: Overview) -> Entry:
     """As the list has it, with the steps of the system clock in between."""
-    seen, utc = found.glance, found.utc
+    seen, utc = found.scanned, found.scanned.utc
     start_ns = None if seen.begin_ns is None else utc.utc_ns(seen.begin_ns)
     end_ns = None if seen.end_ns is None else utc.utc_ns(seen.end_ns)
     return replace(entry_of(seen), start_ns=start_ns, end_utc_ns=end_ns)
@@ -61,13 +61,13 @@ def _row(label: str, text: str) -> Iterator[str]:
 
 
 def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
-    seen = found.glance
+    seen = found.scanned
     stated = seen.metadata.get
     name, known_as = seen.path.resolve().name, stated("session_id", "")
     alias = f", recorded as {known_as}" if known_as not in ("", name) else ""
     yield from _row("session", f"{name}{alias}")
     yield from _row("run", str(seen.run))
-    yield from _row("files", str(found.state))
+    yield from _row("files", str(found.scanned.files))
     yield from _row("recipe", stated("recipe", "?") + (", simulated devices" if seen.simulated else ""))
     if seen.begin_ns is not None and seen.end_ns is not None:
         span = f"{utc.date_time(seen.begin_ns)} to {utc.local_text(seen.end_ns)}"
@@ -83,11 +83,11 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     yield from _row("segments", _segments(seen))
     yield from _row("attached", ", ".join(seen.attachments) or "nothing")
     yield from _said(entry_of(seen))
-    for trouble in _limited(found.troubles):
+    for trouble in _limited(found.scanned.sentences(Files.DAMAGED)):
         yield from _row("damaged", trouble)
-    for text in _limited(seen.missing):
+    for text in _limited(seen.sentences(Files.INCOMPLETE)):
         yield from _row("missing", text)
-    if found.troubles or seen.count(State.UNFINISHED):
+    if found.scanned.sentences(Files.DAMAGED) or seen.count(State.UNFINISHED):
         yield from _row("to do", f"stand session salvage {seen.path}")
 
 
@@ -100,15 +100,15 @@ def _said(entry: Entry) -> Iterator[str]:
     yield from _row("archived", entry.archived or ("not as it is now" if entry.copies else "not yet"))
 
 
-def _segments(seen: Glance) -> str:
+def _segments(seen: Scan) -> str:
     by_series: dict[str, list[int]] = {}
-    for file in seen.files:
+    for file in seen.inventory:
         if file.state is State.FINISHED:
             by_series.setdefault(file.series, []).append(file.size_bytes)
     parts = [f"{series} {len(sizes)} ({size(sum(sizes))})" for series, sizes in by_series.items()]
     others = [
         f"{file.name} is {file.state} ({size(file.size_bytes)})"
-        for file in seen.files
+        for file in seen.inventory
         if file.state is not State.FINISHED
     ]
     return "; ".join([", ".join(parts) or "none finished", *_limited(others)])
@@ -153,7 +153,7 @@ def _frames(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     yield from _limited([_capture(step, utc) for step in captures])
 
 
-def _lost(frames: Frames) -> str:
+def _lost(frames: FramesSummary) -> str:
     parts: list[str] = []
     if frames.dropped:
         parts.append(f"{frames.dropped} lost by the camera or its wire")
@@ -163,14 +163,14 @@ def _lost(frames: Frames) -> str:
     return "".join(f"; {part}" for part in parts)
 
 
-def _capture(step: Step, utc: UtcOffsets) -> str:
+def _capture(step: RunStep, utc: UtcOffsets) -> str:
     stated = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
     asked = step.parameters.get("frames", "?")
     begun = utc.date_time(step.begin_ns)
     return f"{'':<{_LABEL}}step {step.index + 1:<4d} {step.frames} of {asked} frames from {begun}  {stated}"
 
 
-def _temperatures(temperatures: Sequence[Temperature]) -> Iterator[str]:
+def _temperatures(temperatures: Sequence[TemperatureRange]) -> Iterator[str]:
     if not temperatures:
         yield from _row("temperatures", "none")
         return
@@ -200,13 +200,13 @@ def _events(events: Sequence[Event], utc: UtcOffsets) -> Iterator[str]:
 def info_json(found: Overview) -> dict[str, object]:
     """`stand session info --json`: everything, lists in full; a temperature that was never good is null.
     Instants are as in entry_json."""
-    utc = found.utc
+    utc = found.scanned.utc
     return {
         **entry_json(_entry(found)),
-        "files": str(found.state),
-        "troubles": list(found.troubles),
+        "files": str(found.scanned.files),
+        "troubles": list(found.scanned.sentences(Files.DAMAGED)),
         "planned_steps": found.planned_steps,
-        "attachments": list(found.glance.attachments),
+        "attachments": list(found.scanned.attachments),
         "ending": None if found.ending is None else found.ending.text,
         "steps": [
             {**asdict(step), "begin": _instant(step.begin_ns, utc), "end": _instant(step.end_ns, utc)}
@@ -229,7 +229,7 @@ def info_json(found: Overview) -> dict[str, object]:
     }
 
 
-def verify_lines(found: Verification) -> Iterator[str]:
+def verify_lines(found: Scan) -> Iterator[str]:
     """`stand session verify`: the findings, then what was read."""
     yield from map(one_line, map(str, found.findings))
     errors = sum(finding.severity == "error" for finding in found.findings)
@@ -240,6 +240,8 @@ def verify_lines(found: Verification) -> Iterator[str]:
     )
 
 
-def verify_json(found: Verification) -> dict[str, object]:
+def verify_json(found: Scan) -> dict[str, object]:
     """`stand session verify --json`."""
-    return {"sound": found.is_sound, "files": str(found.files), **asdict(found)}
+    counts = {name: getattr(found, name) for name in ("segments", "messages", "frames", "bytes")}
+    findings = [asdict(finding) for finding in found.findings]
+    return {"sound": found.is_sound, "files": str(found.files), "run": str(found.run), "findings": findings, **counts}

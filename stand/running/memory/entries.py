@@ -38,7 +38,7 @@ from pydantic import TypeAdapter, ValidationError
 from thermostand.experiments.steps import Step as PlanStep
 from thermostand.foundation.document_faults import path_text
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.reading.journal_lines import JOURNAL_NAME
+from thermostand.recording.format.journal_lines import JOURNAL_NAME
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,7 @@ from thermostand.foundation.events import JOURNAL_NOT_SAVED, EventKind
 from thermostand.foundation.files import replace_file, sync_folder
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.patience import Patience
-from thermostand.recording.format.layout import TELEMETRY
-from thermostand.recording.reading.journal_lines import (
+from thermostand.recording.format.journal_lines import (
     JOURNAL_NAME,
     LIMIT_BYTES,
     damage_text,
@@ -32,6 +31,7 @@ from thermostand.recording.reading.journal_lines import (
     lines_of,
     mark_of,
 )
+from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.writing.disk import JOURNAL_LINE, Disk
 from thermostand.recording.writing.home import FolderLost
 from thermostand.recording.writing.locks import lock

@@ -104,14 +104,10 @@ class JournalFacts:
     unended: str = ""
     texts: Mapping[str, str] | None = None
 
-    def changed_texts(self, attached: Mapping[str, str]) -> list[str]:
-        """The names of the texts that are not attached as the run began with them, or not at all."""
-        return [name for name, known in (self.texts or {}).items() if text_hash(attached.get(name)) != known]
-
 
 def text_hash(text: str | None) -> str:
     """Of an attached text; "" for none."""
-    return "" if text is None else hashlib.sha256(text.encode()).hexdigest()[:16]
+    return "" if text is None else hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
 def journal_facts(directory: Path) -> JournalFacts | None:

@@ -4,11 +4,12 @@ Only the index, the content of chunks and the attachments have CRCs. The rest st
 each record is and how long, a chunk's own fields and each metadata's name in the index, the message indexes in the
 messages, the counts in the walk. Only text has no second copy: the name of the writer's library in the header,
 which nothing reads, and what metadata says but for the record `session`, which has a CRC in the record `segment`;
-recording/repair/verify.py compares them between segments.
+recording/reading/scan.py compares them between segments.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -68,7 +69,7 @@ class Damage(NamedTuple):
 @dataclass
 class SegmentCheck:
     """What the walk through a segment found. texts: what is attached. descriptions: of its sound frames, as messages.
-    `last_ns`: log time of its latest sound message."""
+    `last_ns`: log time of its latest sound message. sha256: of all its bytes, "" when something is damaged."""
 
     path: Path
     damages: list[Damage] = field(default_factory=list[Damage])
@@ -78,6 +79,7 @@ class SegmentCheck:
     messages: int = 0
     first_ns: float = inf
     last_ns: float = -inf
+    sha256: str = ""
 
 
 def check_segment(path: Path, receive: Callable[[Message], None], report: Callable[[int], None]) -> SegmentCheck:
@@ -89,6 +91,9 @@ def check_segment(path: Path, receive: Callable[[Message], None], report: Callab
         with path.open("rb") as file:
             walk = _Walk(check, file, _indexed(read_summary(file, path.stat().st_size)), receive)
             walk.run(report)
+            if not check.damages:
+                file.seek(0)
+                check.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     except DAMAGE as error:
         check.damages.append(Damage(_sentence(error), -inf, inf))
     return check
