@@ -8,6 +8,7 @@ import pytest
 from tests.recording.damage import names, read_segment
 from tests.system.recording_process import MESSAGES_PER_ROUND, frame_records, images_in, nursery, telemetry_records
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session, salvage_unfinished
 
@@ -45,6 +46,6 @@ def test_nothing_acknowledged_is_missing_after_kill_9(tmp_path, start, kills):
         session = Session.open(directory)
         assert session.frame_count == len(frames)
         assert (session.incomplete, session.damaged) == ((), ())
-        assert all(name.endswith(".mcap") for name in names(directory))
+        assert all(name.endswith((".mcap", MANIFEST_NAME)) for name in names(directory))
         assert salvage_session(directory) == []
     assert left >= {".mcap", ".part"}
