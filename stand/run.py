@@ -7,7 +7,14 @@ import fcntl
 import itertools
 import os
 from collections.abc import AsyncGenerator, Awaitable, Callable, Generator, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, nullcontext, suppress
+from contextlib import (
+    AbstractAsyncContextManager,
+    AsyncExitStack,
+    asynccontextmanager,
+    contextmanager,
+    nullcontext,
+    suppress,
+)
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +50,8 @@ from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WIT
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.safe_ranges import accepted_text
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.running.guest import Guest, Job
+from thermostand.stand.queueing.host import Host
+from thermostand.stand.running.guest import Guest, Job, Work
 from thermostand.stand.running.opening.claim import claimed, latch_file
 from thermostand.stand.running.opening.clock_watch import ClockWatch
 from thermostand.stand.running.opening.open_stand import OpenStand, Time, opened
@@ -204,8 +212,19 @@ async def check_temperature(camera: Camera, hub: Hub, clock: Clock) -> None:
 __all__ = ["Interrupted", "resume", "run_in", "run_real", "run_virtual"]
 
 
+# What answers the clients of a run, which records in this folder, while inside.
+Front = Callable[[StandService, Path], AbstractAsyncContextManager[object]]
+
+
 async def _nobody(_: Path) -> None:
     """Gets the session and does nothing."""
+
+
+@asynccontextmanager
+async def by_socket(service: StandService, session: Path) -> AsyncGenerator[None]:
+    """Clients of this machine and user alone: any number of virtual runs go side by side."""
+    async with serve(service, session, service.stand, Interface(session.parent), service.patience):
+        yield
 
 
 async def run_virtual(
@@ -214,30 +233,37 @@ async def run_virtual(
     seed: int | None,
     watch: Callable[[Hub], None],
     begun: Callable[[Path], Awaitable[None]] = _nobody,
+    front: Front = by_socket,
 ) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
     Of a real stand's file the devices are replaced.
     The laboratory takes free addresses, not the configured ones: any number of virtual runs go side by side.
     The same order and seed give the same session, byte for byte. `watch` may subscribe to the hub before the start;
-    `begun` gets the folder as soon as a run that is killed could be resumed in it.
+    `begun` gets the folder as soon as a run that is killed could be resumed in it; `front` answers from then on.
     Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
     """
     order = rehearsed(order)
     simulation = order.config.simulation
     if simulation is None:
         raise ValueError("a rehearsal has a simulated laboratory")
-    return await _run_virtual(Job(order, out, seed, watch, begun), seconds_ns(simulation.start.timestamp()))
+    return await _run_virtual(Job(order, out, seed, watch, begun), front, seconds_ns(simulation.start.timestamp()))
 
 
 async def run_real(
-    order: Order, out: Path, watch: Callable[[Hub], None], begun: Callable[[Path], Awaitable[None]] = _nobody
+    order: Order,
+    out: Path,
+    watch: Callable[[Hub], None],
+    begun: Callable[[Path], Awaitable[None]] = _nobody,
+    front: Front = by_socket,
 ) -> Path:
     """Run on the host's clock, against the devices at the configured addresses; else as run_virtual."""
-    return await _kept_on(Job(order, out, None, watch, begun), WallClock())
+    return await _kept_on(Job(order, out, None, watch, begun), front, WallClock())
 
 
-async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0) -> Path:
+async def resume(
+    before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0, front: Front = by_socket
+) -> Path:
     """Resume an interrupted run, in the time it was run in, and add to its session; raises as run_virtual.
 
     What is done is not done again. In virtual time the laboratory is a new one with a chamber at room temperature,
@@ -247,13 +273,13 @@ async def resume(before: Interruption, watch: Callable[[Hub], None], downtime_s:
     try:
         job = Job(before.order, before.directory.parent, before.seed, watch, _nobody, before)
         if is_of_virtual_time(before):
-            return await _run_virtual(job, before.last_ns + seconds_ns(downtime_s))
-        return await _kept_on(job, WallClock(before.last_ns + 1))
+            return await _run_virtual(job, front, before.last_ns + seconds_ns(downtime_s))
+        return await _kept_on(job, front, WallClock(before.last_ns + 1))
     finally:
         before.release()
 
 
-async def _kept_on(job: Job, clock: WallClock) -> Path:
+async def _kept_on(job: Job, front: Front, clock: WallClock) -> Path:
     """Run on the host's clock. When the process that writes the session is killed, the stand is made safe and closed,
     and the run resumed with another one."""
     restarts, directory = WriterRestarts(), None if job.before is None else job.before.directory
@@ -269,7 +295,7 @@ async def _kept_on(job: Job, clock: WallClock) -> Path:
         stop = Stop()
         try:
             async with stop:
-                return await _run(job, clock, None, stop)
+                return await _run(job, front, clock, None, stop)
         except StandTripped:
             if directory is None or stop.is_unsafe or not restarts.may_follow(stop.reason, clock.now_ns()):
                 raise
@@ -307,7 +333,7 @@ async def run_in(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
             job.before.release()
 
 
-async def _run_virtual(job: Job, start_ns: int) -> Path:
+async def _run_virtual(job: Job, front: Front, start_ns: int) -> Path:
     order = job.order
     laboratory = laboratory_of(
         order.config, virtual=True, seed=job.seed, start_ns=start_ns, is_anywhere=not order.at_configured_addresses
@@ -321,7 +347,7 @@ async def _run_virtual(job: Job, start_ns: int) -> Path:
         await control.open()
         clock = VirtualClock(start_ns, control.advance)
         there = replace(job, order=replace(order, config=relocated(order.config, simulator.addresses)))
-        return await _run(there, clock, clock.run, stop)
+        return await _run(there, front, clock, clock.run, stop)
 
 
 async def _started(laboratory: Mapping[str, object]) -> Simulator:
@@ -335,7 +361,7 @@ async def _started(laboratory: Mapping[str, object]) -> Simulator:
         raise
 
 
-async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
+async def _run(job: Job, front: Front, clock: Clock, time: Time | None, stop: Stop) -> Path:
     """The whole run; one on a real stand has it for itself from before anything is opened, or does not touch it."""
     directory = _directory(job, clock)
     async with claimed(job.order.config, directory) if isinstance(clock, WallClock) else nullcontext():
@@ -353,7 +379,8 @@ async def _run(job: Job, clock: Clock, time: Time | None, stop: Stop) -> Path:
             alerts = alerting(assembly.config.name, assembly.config.alerts, hub, clock)
             async with alerts, _telling_failure(assembly, directory, stop):
                 async with opened(assembly, time, stop, is_for_one=True) as open_stand:
-                    recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk)
+                    answer = partial(_answer, open_stand, directory, front)
+                    recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk, answer)
                 _check_outcome(directory, recorder, assembly)
         finally:
             assembly.notifier.close()
@@ -422,7 +449,13 @@ async def _telling_failure(assembly: Assembly, directory: Path, stop: Stop) -> A
 
 
 async def _stay(
-    job: Job, directory: Path, open_stand: OpenStand, early: _Early, stop: Stop, disk: Disk | None
+    job: Job,
+    directory: Path,
+    open_stand: OpenStand,
+    early: _Early,
+    stop: Stop,
+    disk: Disk | None,
+    answer: Callable[[], Work] | None = None,
 ) -> Recorder:
     """From the camera's start to the end of the recording."""
     is_camera_on = job.before is None or job.before.kept.set_up.camera_on
@@ -433,16 +466,15 @@ async def _stay(
         recorder = await open_stand.or_safe(_recording(job, directory, open_stand.assembly, early, disk), stop)
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording, stop)
-        answer = partial(_answer, open_stand, directory) if open_stand.is_for_one else None
         await Guest(job, open_stand, recorder, stop, answer).run(recording)
     return recorder
 
 
-async def _answer(open_stand: OpenStand, directory: Path) -> None:
+async def _answer(open_stand: OpenStand, directory: Path, front: Front) -> None:
     """Answer clients of a run by itself until cancelled; it can do without any."""
-    service, assembly = StandService(open_stand), open_stand.assembly
+    assembly = open_stand.assembly
     try:
-        async with serve(service, directory, assembly.config.name, Interface(directory.parent), service.patience):
+        async with front(StandService(Host(open_stand)), directory):
             await asyncio.Event().wait()
     except StandError as error:
         assembly.hub.publish(NO_CONTROL.at(assembly.clock.now_ns(), f"the run cannot be queried or paused: {error}"))

@@ -6,8 +6,8 @@ the page is the page's.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Coroutine, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Protocol, cast
+from collections.abc import Collection, Coroutine, Sequence
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import ConfigDict, Field, JsonValue
 
@@ -43,10 +43,9 @@ if TYPE_CHECKING:
 
     from thermostand.foundation.patience import Patience
     from thermostand.recording.writing.disk import DiskCalls
+    from thermostand.stand.queueing.host import Host
     from thermostand.stand.queueing.orders import Orders
     from thermostand.stand.running.course import Course
-    from thermostand.stand.running.guest import Guest
-    from thermostand.stand.running.opening.open_stand import OpenStand
 
 _NOTHING_RUNS = "nothing is run now"
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"
@@ -143,58 +142,24 @@ class NoteRequest(Document):
     tags: tuple[Tag, ...] = Field(default=(), max_length=32)
 
 
-class Daemon(Protocol):
-    """What a stand has besides its runs when a daemon owns it for days."""
-
-    orders: Orders
-
-    def stop(self) -> None:
-        """The stand is made safe at once; a run that has it ends."""
-        ...
-
-    def seen(self) -> dict[str, object]:
-        """The fields of the state that are a daemon's."""
-        ...
-
-    def devices(self) -> tuple[DeviceState, ...]:
-        """What is there, and what it takes by hand now."""
-        ...
-
-    async def do_by_hand(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
-        """What came of it within a moment, as a sentence."""
-        ...
-
-    def wake(self) -> None:
-        """There may be something to be run."""
-        ...
-
-    def note(self) -> None:
-        """Write down what the next daemon has to know."""
-        ...
-
-    def clear_queue(self) -> None:
-        """A queue that was halted goes on."""
-        ...
-
-
 class StandService(Served):
-    """Of an open stand; without a daemon it is that of one run."""
+    """Of the open stand that `host` has: for days, or for one run."""
 
-    def __init__(self, open_stand: OpenStand, daemon: Daemon | None = None) -> None:
-        assembly = open_stand.assembly
+    def __init__(self, host: Host) -> None:
+        assembly = host.open_stand.assembly
         super().__init__(assembly.hub, assembly.clock)
-        self._open_stand = open_stand
-        self._daemon = daemon
+        self._host = host
+        self._open_stand = host.open_stand
         self._assembly = assembly
 
     def state(self) -> StandState:
         """As it is now."""
-        assembly, run, daemon = self._assembly, self._run, self._daemon
-        changes: dict[str, object] = {} if daemon is None else daemon.seen()
+        assembly, run, host = self._assembly, self._run, self._host
+        changes = host.seen()
         if run is not None:
             changes.update(run.seen())
-        elif daemon is not None and self._open_stand.guest is not None:
-            changes["phase"] = "stopping" if daemon.orders.leaving else "running"
+        elif host.guest is not None:
+            changes["phase"] = "stopping" if host.is_leaving else "running"
         latch = self._open_stand.latch
         if (fault := latch.fault) is not None:
             changes["fault"] = FaultState(rule=fault.rule, text=fault.text, since_ns=latch.since_ns, data=fault.data)
@@ -209,18 +174,8 @@ class StandService(Served):
         return self._running().check_edit(from_index, steps)
 
     def devices(self) -> tuple[DeviceState, ...]:
-        """The commands that devices take by hand; none while one run has the stand for itself."""
-        if self._daemon is not None:
-            return self._daemon.devices()
-        return tuple(
-            DeviceState(
-                name=name,
-                kind=kind,
-                channels=tuple(channel for channel in self.hub.readings if channel.startswith(f"{name}.")),
-                refused="a run has the stand",
-            )
-            for name, kind in self._kinds().items()
-        )
+        """The commands that devices take by hand, between runs."""
+        return self._host.devices()
 
     async def known_faults(self) -> SimulatedFaults:
         """Of the simulated laboratory."""
@@ -241,11 +196,8 @@ class StandService(Served):
 
         Example: stand stop
         """
-        if self._daemon is not None:
-            self._daemon.stop()
-        elif (guest := self._guest) is not None:
-            guest.stop()
-        return "the stand is made safe" + ("" if self._guest is None else ", and the run ends")
+        self._host.stop()
+        return "the stand is made safe" + ("" if self._host.guest is None else ", and the run ends")
 
     @command("/run/pause")
     def pause(self, who: Who, given: PauseRequest) -> str:
@@ -274,14 +226,13 @@ class StandService(Served):
     @command("/run/clear", verbs=())
     def clear(self, who: Who) -> str:
         """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
-        daemon, fault = self._daemon, self._open_stand.latch.fault
-        if fault is None and (daemon is None or not daemon.orders.queued.halted):
-            raise Conflict(f"there is nothing to clear: no interlock holds this {'run' if daemon is None else 'stand'}")
+        host, orders = self._host, self._host.orders
+        if self._open_stand.latch.fault is None and (orders is None or not orders.queued.halted):
+            raise Conflict(f"there is nothing to clear: no interlock holds this {'run' if orders is None else 'stand'}")
         still = self._open_stand.clear()
-        if daemon is not None:
-            daemon.note()
-            if self._open_stand.latch.fault is None:
-                daemon.clear_queue()
+        host.note()
+        if self._open_stand.latch.fault is None:
+            host.clear_queue()
         return f"cleared; {still}" if still else "cleared"
 
     @command("/run/skip")
@@ -321,11 +272,10 @@ class StandService(Served):
 
         Example: stand submit night.yaml --key monday
         """
-        daemon = self._queueing()
-        order = RunRequest.model_validate(given.model_dump(exclude={"key"}))
-        entry = await daemon.orders.submit(who, order, given.key)
-        daemon.wake()
-        return daemon.orders.shown_run(entry)
+        orders, order = self._orders(), RunRequest.model_validate(given.model_dump(exclude={"key"}))
+        entry = await orders.submit(who, order, given.key)
+        self._host.wake()
+        return orders.shown_run(entry)
 
     @command("/queue/{run}", http="DELETE", verbs=("queue remove",), title="Remove")
     async def cancel(self, who: Who, given: CancelRequest) -> str:
@@ -333,9 +283,8 @@ class StandService(Served):
 
         Example: stand queue remove 5
         """
-        daemon = self._queueing()
-        await daemon.orders.cancel(given.run)
-        daemon.wake()
+        await self._orders().cancel(given.run)
+        self._host.wake()
         return f"run {given.run} is out of the queue"
 
     @command("/queue/{run}/move", verbs=("queue move",))
@@ -344,29 +293,24 @@ class StandService(Served):
 
         Example: stand queue move 5 1
         """
-        await self._queueing().orders.move(given.run, given.to)
+        await self._orders().move(given.run, given.to)
         return f"run {given.run} has turn {given.to}"
 
     @command("/sessions/{session}/resume", verbs=())
     async def resume(self, who: Who, given: ResumeRequest) -> str:
         """Resume an interrupted run in its session; it is the next one."""
-        if self._daemon is None:
-            raise Conflict("a run has the stand; a session is resumed when it has ended")
+        orders = self._orders()
         if self._open_stand.latch.fault is not None:
             raise Conflict("the stand has tripped; clear it first")
-        entry = await self._daemon.orders.resume(given.session)
-        self._daemon.wake()
+        entry = await orders.resume(given.session)
+        self._host.wake()
         return f"run {entry.id} is resumed next"
 
     @command("/devices/{device}/{verb}", verbs=())
     async def device(self, who: Who, given: DeviceRequest) -> str:
         """Tell a device something between runs, through the same gate as a run. What takes longer than a moment goes on
         when this is answered, and its failure is an event."""
-        if self._daemon is not None:
-            return await self._daemon.do_by_hand(given.device, given.verb, given.arguments)
-        if given.device not in (kinds := self._kinds()):
-            raise Missing(f"this stand has no device of that name; there are {', '.join(kinds)}")
-        raise Conflict("a run has the stand; pause does not change that, STOP ends the run")
+        return await self._host.do_by_hand(given.device, given.verb, given.arguments)
 
     @command("/sessions/{session}/notes", verbs=(), by_secop=None)
     async def note(self, who: Who, given: NoteRequest) -> str:
@@ -385,18 +329,19 @@ class StandService(Served):
         return await break_or_mend(self._assembly, given)
 
     @property
+    def stand(self) -> str:
+        """The name of the stand."""
+        return self._assembly.config.name
+
+    @property
     def patience(self) -> Patience:
         """Of a stand that is closed."""
         return self._open_stand.patience
 
     @property
-    def _guest(self) -> Guest | None:
-        return cast("Guest | None", self._open_stand.guest)
-
-    @property
     def _run(self) -> Course | None:
         """Of the run that has the stand, once it can be asked anything."""
-        guest = self._guest
+        guest = self._host.guest
         return None if guest is None else guest.course
 
     def _running(self) -> Course:
@@ -416,20 +361,14 @@ class StandService(Served):
             raise Missing(f"the plan has no step {wanted}; `stand status --plan` shows those there are")
         return run, found[0]
 
-    def _queueing(self) -> Daemon:
-        if self._daemon is None:
+    def _orders(self) -> Orders:
+        if self._host.orders is None:
             raise Conflict(_NO_QUEUE)
-        return self._daemon
-
-    def _kinds(self) -> Mapping[str, str]:
-        from thermostand.stand.assembly import device_kinds
-
-        return device_kinds(self._assembly.config)
+        return self._host.orders
 
     async def _notes_of(self, session: str) -> tuple[Path, DiskCalls]:
         """The folder of a session, and what writes its file of notes."""
-        if self._daemon is not None:
-            orders = self._daemon.orders
+        if (orders := self._host.orders) is not None:
             return await orders.reading.call(orders.folder_of, session), orders.notes
         run = self._running()
         if session != run.directory.name:

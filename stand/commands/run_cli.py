@@ -31,6 +31,7 @@ from thermostand.stand.running.resume import interruption, is_of_virtual_time
 from thermostand.stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
 from thermostand.stand.serving.client import Server, server_at
 from thermostand.stand.serving.desk import QueuedRun
+from thermostand.stand.serving.front import interface_of
 from thermostand.stand.watching.live import followed
 
 app = App()
@@ -58,8 +59,8 @@ def demo(
     directory = _unused(out)
     _check_writable(directory)
     night = price_night(tuple(order.recipe.plan()), order.config, directory)
-    with followed(order, night, directory, is_virtual=True) as watch:
-        session = asyncio.run(run_virtual(order, directory, None, watch))
+    with followed(night, directory, is_virtual=True) as shown:
+        session = asyncio.run(run_virtual(order, directory, None, shown.watch, front=shown.front))
     _show_session(session, directory, f"session  {session}", report=True)
 
 
@@ -107,8 +108,13 @@ def run(
     night = price_night(tuple(order.recipe.plan()), order.config, directory)
     if lack := small_disk(directory, night.steps, order.config):
         say(f"warning: {directory}: {lack}")
-    with followed(order, night, directory, is_virtual=virtual_time) as watch:
-        work = run_virtual(order, directory, seed, watch) if virtual_time else run_real(order, directory, watch)
+    interface = None if virtual_time else interface_of(order.config, directory)
+    with followed(night, directory, is_virtual=virtual_time) as shown:
+        if interface is None:
+            work = run_virtual(order, directory, seed, shown.watch, front=shown.front)
+        else:
+            front = shown.front_at(interface, order.target_text)
+            work = run_real(order, directory, shown.watch, front=front)
         session = asyncio.run(work)
     _finished(session, order.config, report=report)
 
@@ -160,8 +166,15 @@ def resume_run(
         before.release()
         _resume_there(server, directory, attended=attended, report=report)
         return
-    with followed(order, night, directory, is_virtual=is_virtual, before=before) as watch:
-        session = asyncio.run(resume(before, watch))
+    sessions = directory.parent
+    try:
+        interface = None if is_virtual else interface_of(order.config, sessions)
+    except BaseException:
+        before.release()
+        raise
+    with followed(night, sessions, is_virtual=is_virtual) as shown:
+        front = shown.front if interface is None else shown.front_at(interface, order.target_text)
+        session = asyncio.run(resume(before, shown.watch, front=front))
     _finished(session, order.config, report=report)
 
 

@@ -7,9 +7,8 @@ import os
 import signal
 from collections.abc import AsyncGenerator, Callable, Generator
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -31,12 +30,7 @@ from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.order import optics_texts
 from thermostand.stand.service import StandService
 from thermostand.stand.serving.api.access import TokenBook
-from thermostand.stand.serving.api.bridge import Bridge
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.api.server import serve as serve_clients
-from thermostand.stand.serving.api.server import try_doors
-from thermostand.stand.serving.secop.door import door_at
-from thermostand.stand.serving.viewing import Viewing
+from thermostand.stand.serving.front import HERE, front, interface_of
 from thermostand.stand.watching.live import aside
 from thermostand.stand.watching.remedies import next_command
 
@@ -101,7 +95,6 @@ def _has_terminal() -> bool:
 
 
 app = App()
-_HERE = "127.0.0.1"
 
 
 @app.command()
@@ -112,7 +105,7 @@ def serve(
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Listen by TCP, too; without it the Unix socket only.")
     ] = None,
-    host: Annotated[str, typer.Option(help="The address to listen at, with --port.")] = _HERE,
+    host: Annotated[str, typer.Option(help="The address to listen at, with --port.")] = HERE,
     secop: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Serve SECoP on this machine, usually at 10767.")
     ] = None,
@@ -126,37 +119,31 @@ def serve(
     Example: stand serve laboratory.yaml --out /data/sessions
     """
     config = named_config(configuration, by_option)
-    if port is None and host != _HERE:
-        raise ConfigError(f"--host {host}: give --port, too; without one nothing listens there")
     path = packaged("", config)
     stand = load_config(path)
+    if port is None and stand.interface.port is None and host != HERE:
+        raise ConfigError(f"--host {host}: give --port, too; without one nothing listens there")
     texts = _attachments(path, stand)
     directory = (out or stand.recording.directory).absolute()
     secrets, trusts = stand.interface.secrets, stand.interface.trust_loopback
-    book = TokenBook(None if secrets is None else load_tokens(secrets))
-    secop_port = stand.interface.secop_port if secop is None else secop
-    others = () if secop_port is None else (door_at(secop_port, read_only=trusts == "read-only"),)
-    interface = Interface(directory, host, port, book, stand.interface.hosts, trusts_loopback=trusts, doors=others)
-    interface.check()
-    try_doors(interface)
+    interface = interface_of(stand, directory, host, port, secop)
 
     @asynccontextmanager
-    async def front(service: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
-        viewing = Viewing(hub, clock, directory, texts["target.yaml"])
-        served = replace(interface, rooms=(_page(viewing),))
-        async with serve_clients(service, directory, stand.name, served, service.patience):
+    async def answering(service: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
+        port, others = interface.port, interface.doors
+        async with front(service, directory, stand.name, interface, texts["target.yaml"], service.patience):
             where = f"; http://{host}:{port}/" if port is not None else ""
-            where += f"; SECoP at {secop_port}" if secop_port is not None else ""
+            where += "".join(f"; SECoP at {each.port}" for each in others)
             event = OPEN.at(clock.now_ns(), where, stand=stand.name, sessions=str(directory), port=port)
             _tell_json(event) if output().as_json else say(event.text)
             with _events_shown(hub):
                 if secrets is not None and trusts and (port is not None or others):
                     may = "may look at this stand and stop it" if trusts == "read-only" else "operates this stand"
                     hub.publish(LOOPBACK_TRUSTED.at(clock.now_ns(), may))
-                Reloading(secrets, book, clock.now_ns, hub.publish).begin()
+                Reloading(secrets, interface.tokens, clock.now_ns, hub.publish).begin()
                 yield
 
-    asyncio.run(serve_stand(stand, config, texts, directory, front, has_reports=not no_reports))
+    asyncio.run(serve_stand(stand, config, texts, directory, answering, has_reports=not no_reports))
 
 
 def _attachments(path: Path, stand: StandConfig) -> dict[str, str]:
@@ -185,15 +172,6 @@ def _events_shown(hub: Hub) -> Generator[None]:
             yield
         finally:
             hub.unsubscribe(follow)
-
-
-def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
-    def room(bridge: Bridge) -> Any:
-        from thermostand.stand.serving.page_room import PageRoom  # FastAPI, which the thread loads that serves clients
-
-        return PageRoom(viewing)(bridge)
-
-    return room
 
 
 def _tell(event: Event) -> None:

@@ -98,7 +98,7 @@ def login(
 
 
 def _say_when(what: str) -> None:
-    """How a daemon learns of it. No signal is sent from here: to `stand run`, which has no tokens, it is an end."""
+    """How a daemon learns of it. No signal is sent from here: for `stand run`, which reads them once, it is an end."""
     say(f"a running `stand serve` {what} at SIGHUP (`systemctl reload` of its unit, or kill -HUP), or its next start")
 
 

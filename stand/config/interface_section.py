@@ -20,11 +20,12 @@ Token = Annotated[str, Field(pattern=r"^[!-~]{20,200}$")]
 
 
 class InterfaceConfig(Document):
-    """How a stand is reached over the network, with `stand serve --port`. hosts: names under which browsers and
+    """How a stand is reached over the network. port: where `stand serve` and `stand run` have the page and the HTTP
+    interface on this machine, as with --port; by the Unix socket only without it. hosts: names under which browsers and
     programs reach it, besides this machine's own, such as that of a proxy. secrets: a YAML file (mode 0600) with
     tokens, by the name of who has them; `stand token add` writes it, and it is never recorded or shown. Where it is
-    named, also while nobody is in it, every request over the network needs a token. secop_port: where `stand serve`
-    answers SECoP on this machine, usually 10767, as with --secop; not at all without it. trust_loopback: who asks from
+    named, also while nobody is in it, every request over the network needs a token. secop_port: where they
+    answer SECoP on this machine, usually 10767, as with --secop; not at all without it. trust_loopback: who asks from
     this machine needs no token all the same, and may do everything (`true`), or only look and press STOP
     (`read-only`, also where no secrets are named); a proxy on this machine that adds no header makes everybody behind
     it one who asks from this machine.
@@ -33,6 +34,7 @@ class InterfaceConfig(Document):
     trust_loopback: bool | Literal["read-only"] = False
     hosts: tuple[HostName, ...] = Field(default=(), max_length=50)
     secrets: Path | None = None
+    port: int | None = Field(default=None, ge=1, le=65535)
     secop_port: int | None = Field(default=None, ge=1, le=65535)
 
 

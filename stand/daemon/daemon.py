@@ -7,21 +7,18 @@ end: the run stopped, the stand safe and tried until it confirms, the record com
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import cast
-
-from pydantic import JsonValue
 
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.experiments.steps import Capture
 from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
 from thermostand.foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
 from thermostand.foundation.events import (
-    BY_HAND_FAILED,
     CAMERA_NOT_OPENED,
     GUARD,
     HOUSE_NOT_ENDED,
@@ -33,7 +30,6 @@ from thermostand.foundation.events import (
     RECORDING_RESTARTED,
     RUN_END,
     RUN_FAILED,
-    EventKind,
 )
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
@@ -41,29 +37,28 @@ from thermostand.foundation.tasks import cancelled, failure_text, watched
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.daemon import systemd
-from thermostand.stand.daemon.by_hand import ByHand
 from thermostand.stand.daemon.daemon_file import Counters, Kept, KeptFile
 from thermostand.stand.daemon.day_record import DayRecord
 from thermostand.stand.estimating.learned import learn
 from thermostand.stand.fault import Fault
+from thermostand.stand.queueing.host import Host
 from thermostand.stand.queueing.orders import Orders, said_of
 from thermostand.stand.queueing.queue_file import Entry
 from thermostand.stand.queueing.queue_work import Halt, Notes, Stopped, Watch, drain, interruption_of, is_complete
 from thermostand.stand.run import run_in
 from thermostand.stand.running.course import keep
 from thermostand.stand.running.executing.settling_watch import load_for
-from thermostand.stand.running.guest import Guest, Job
+from thermostand.stand.running.guest import Job
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import STOPPED, Stop, catch_signals
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
 from thermostand.stand.running.resume import Interruption, repaired
 from thermostand.stand.service import StandService
-from thermostand.stand.serving.desk import Conflict, DeviceState, HeatByHand, Who
+from thermostand.stand.serving.desk import Conflict, QueuedRun, Who
 
 # What answers the clients of a stand while inside.
 Front = Callable[[StandService, Hub, WallClock], AbstractAsyncContextManager[object]]
 
-_BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
 _ENDS = Fault(STOPPED.rule, "the daemon was ended")
 _STOPPED_LOOK_S = 0.1  # whether the run has ended that was stopped
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
@@ -71,7 +66,7 @@ _KEEP_EVERY_S = 60.0
 _ENDED_AGAIN_S = 5.0  # between two records that end by themselves
 
 
-class Daemon:
+class Daemon(Host):
     """An open stand with its queue and record. `serve` until it is asked to leave, or something fails."""
 
     def __init__(
@@ -83,54 +78,47 @@ class Daemon:
         keep: KeptFile,
         recorded: Callable[[Path], None] | None = None,
     ) -> None:
-        assembly = open_stand.assembly
-        self.open_stand = open_stand
-        self.orders = orders
+        super().__init__(open_stand, orders)
+        config = self._assembly.config
+        self._orders = orders
         self.record = record
-        config, hub = assembly.config, assembly.hub
-        self.counters = Counters(kept.counters, config.axes, config.chamber.heater_W, hub)
-        self.by_hand = ByHand(assembly, self._check_heat)
-        self.service = StandService(open_stand, self)
+        self.counters = Counters(kept.counters, config.axes, config.chamber.heater_W, self._hub)
+        self.service = StandService(self)
         self.has_guest = False  # from the moment it is let in until it has gone
         self._is_draining = False  # until the queue knows how its run has ended
-        self._assembly = assembly
-        self._hub = hub
-        self._clock = assembly.clock
         self._keep = keep
         self._recorded_whole = recorded  # is told of complete runs with frames
         self._status = systemd.Status()
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
         self._is_given_up = False  # an operator does not want to wait for the confirmation that the stand is safe
-        self._hands: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
         self._others: set[asyncio.Task[None]] = set()
         self._extending: list[asyncio.Task[None]] = []
         self._restarts, self._run_id = WriterRestarts(), 0  # after which run that had the stand last
-        hub.subscribe(self._follow)
+        self._hub.subscribe(self._follow)
         self._recorded_ns = self._turned_ns = 0  # when a record was last begun, or that of a new day, or could not be
 
     @property
-    def guest(self) -> Guest | None:
-        """The run that has the stand."""
-        return cast("Guest | None", self.open_stand.guest)
+    def has_run(self) -> bool:
+        """From the moment a run is let in until it has gone."""
+        return self.has_guest
+
+    @property
+    def is_leaving(self) -> bool:
+        """Whether it has been asked to leave."""
+        return self._orders.leaving
 
     def seen(self) -> dict[str, object]:
         """The fields of the state that are a daemon's; disk_free_bytes is 0 when it is not known."""
-        recorder, ordered = self.record.recorder, self._assembly.stand.chamber.ordered
-        by_hand = None
-        if ordered is not None and not self.has_guest:  # as it was ordered: the regulator may not answer
-            by_hand = HeatByHand(**asdict(ordered), cut_ns=self._assembly.stand.chamber.permits.ended_ns)
-        return {
-            "queue": self.orders.shown(),
-            "queue_halted": self.orders.queued.halted,
+        recorder = self.record.recorder
+        return super().seen() | {
+            "queue_halted": self._orders.queued.halted,
             "counters": {name: round(value, 4) for name, value in self.counters.values.items()},
-            "busy": self.busy,
             "disk_free_bytes": 0 if recorder is None else recorder.disk_free_bytes,
-            "by_hand": by_hand,
         }
 
-    def devices(self) -> tuple[DeviceState, ...]:
-        """What is there, and what it takes by hand now."""
-        return self.by_hand.devices(self.refused_by_hand())
+    def queue(self) -> tuple[QueuedRun, ...]:
+        """As Host."""
+        return self._orders.shown()
 
     def wake(self) -> None:
         """There may be something to be run."""
@@ -140,7 +128,7 @@ class Daemon:
         """As soon as the stand is confirmed safe; may be called again."""
         if not self._extending:
             self._extending.append(asyncio.create_task(systemd.extending()))
-        self.orders.leaving = True
+        self._orders.leaving = True
         self.stop()
         if not self._leaving.is_set():
             self._beside(self.open_stand.hurry())
@@ -148,10 +136,10 @@ class Daemon:
 
     def stop(self) -> None:
         """The stand is made safe at once; a run that has it ends."""
-        for hand in self._hands:
+        for hand in self.hands:
             hand.cancel()
-        if self.orders.stop is not None:
-            self.orders.stop(_ENDS if self.orders.leaving else STOPPED)
+        if self._orders.stop is not None:
+            self._orders.stop(_ENDS if self._orders.leaving else STOPPED)
         else:
             self._assembly.stand.safety.demand()
         if self._leaving.is_set():
@@ -164,41 +152,6 @@ class Daemon:
     def clear_queue(self) -> None:
         """What halted it has been looked into."""
         self._beside(self._clear_queue())
-
-    @property
-    def busy(self) -> tuple[str, ...]:
-        """The devices that carry out an order: of a run, or by hand."""
-        return tuple(dict.fromkeys((*self._assembly.stand.motions.names, *self._hands.values())))
-
-    def refused_by_hand(self) -> str:
-        """Why no device takes an order now, "" when they do."""
-        if self.has_guest:
-            return "a run has the stand; STOP ends it"
-        if self.open_stand.latch.fault is not None:
-            return f"the stand has tripped: {self.open_stand.latch.fault.text}; clear it once the cause is removed"
-        reasons = self._assembly.stand.gate.reasons
-        return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
-
-    async def do_by_hand(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
-        """What came of it within a moment, as a sentence; Conflict when that is nothing good, or it is refused."""
-        if refused := self.refused_by_hand():
-            raise Conflict(refused)
-        what = f"{name} {verb}"
-        hand = asyncio.ensure_future(self.by_hand.work(name, verb, arguments))
-        self._hands[hand] = name
-        hand.add_done_callback(self._hands.pop)
-        done, _ = await asyncio.wait([hand], timeout=_BY_HAND_S)
-        if not done:
-            hand.add_done_callback(lambda ended: self._tell_failure(what, ended))
-            return f"{what}: under way"
-        if hand.cancelled():
-            raise Conflict(f"{what}: stopped")
-        error = hand.exception()
-        if isinstance(error, StandError):
-            raise Conflict(str(error)) from error
-        if error is not None:
-            raise error
-        return f"{what}: done"
 
     async def serve(self, front: Front) -> None:
         """Until `leave`; then the stand is safe. Raises what makes that impossible."""
@@ -229,7 +182,7 @@ class Daemon:
                 finally:
                     await self._end_guest(worker)
         finally:
-            await cancelled([*tasks, *self._hands, *self._others])
+            await cancelled([*tasks, *self.hands, *self._others])
 
     async def _left(self) -> None:
         await self._leaving.wait()
@@ -237,10 +190,10 @@ class Daemon:
     async def _end_guest(self, worker: asyncio.Task[None]) -> None:
         """The run has made the stand safe, and completed its session, before anything else ends. One that has not
         begun, or waits for a disk after its end, is not waited for."""
-        self.orders.leaving = True
-        while self.orders.stop is not None and not worker.done():
-            if self.orders.stop.reason is None:  # once: another stop says that nobody wants to wait any more
-                self.orders.stop(_ENDS)
+        self._orders.leaving = True
+        while self._orders.stop is not None and not worker.done():
+            if self._orders.stop.reason is None:  # once: another stop says that nobody wants to wait any more
+                self._orders.stop(_ENDS)
             await asyncio.wait([worker], timeout=_STOPPED_LOOK_S)
         if self._is_draining:
             await self.open_stand.patience.wait(worker, FINISH_WITHIN_S)
@@ -250,15 +203,15 @@ class Daemon:
 
     async def _work(self) -> None:
         """The queue, whenever there is something in it and nothing is halted."""
-        await self.orders.ready()
+        await self._orders.ready()
         self.wake()
         await self._adopt_camera()
-        disk, directory = self.orders.disk, self.orders.directory
+        disk, directory = self._orders.disk, self._orders.directory
         while True:
             await self._wake.wait()
             self._wake.clear()
-            queued = self.orders.queued
-            if self.open_stand.latch.fault is not None or queued.halted or self.orders.leaving:
+            queued = self._orders.queued
+            if self.open_stand.latch.fault is not None or queued.halted or self._orders.leaving:
                 continue
             if not any(entry.is_open for entry in queued.entries):
                 continue
@@ -272,11 +225,11 @@ class Daemon:
             finally:
                 self._is_draining = False
             with suppress(SessionError):
-                await self.orders.read()
+                await self._orders.read()
 
     async def _restart_recording(self) -> None:
         """What an operator would do after the process that writes a run's session was killed: clear, and resume."""
-        if self.orders.leaving or self._assembly.stand.safety.unconfirmed:
+        if self._orders.leaving or self._assembly.stand.safety.unconfirmed:
             return
         if not self._restarts.may_follow(self.open_stand.latch.fault, self._clock.now_ns()):
             return
@@ -285,9 +238,9 @@ class Daemon:
         if self.open_stand.latch.fault is not None:  # something else is wrong, too
             return
         try:
-            await self.orders.read()
-            session = next(entry.session for entry in self.orders.queued.entries if entry.id == self._run_id)
-            await self.orders.resume(session)
+            await self._orders.read()
+            session = next(entry.session for entry in self._orders.queued.entries if entry.id == self._run_id)
+            await self._orders.resume(session)
         except StandError as error:
             self._tell(NOT_RESUMED, str(error), run=self._run_id)
             return
@@ -295,7 +248,7 @@ class Daemon:
         self.wake()
 
     async def _run_one(self, entry: Entry, notes: Notes) -> Path:
-        if self.orders.leaving:
+        if self._orders.leaving:
             raise Interrupted("the daemon ends")
         if self.open_stand.latch.fault is not None:
             raise StandTripped(f"the stand has tripped: {self.open_stand.latch.fault.text}")
@@ -308,15 +261,15 @@ class Daemon:
             self._beside(self._hand_over())
 
         def follow(item: Item) -> None:
-            if has_begun and isinstance(item, Event) and item.kind == RUN_END and not self.orders.leaving:
+            if has_begun and isinstance(item, Event) and item.kind == RUN_END and not self._orders.leaving:
                 self._beside(self._record_behind())
 
         self.has_guest = True
         self._status.tell(f"run {entry.id} ({entry.recipe})")
         self._hub.subscribe(follow)
         try:
-            await cancelled(list(self._hands))
-            await self.orders.read()
+            await cancelled(list(self.hands))
+            await self._orders.read()
             if self._assembly.stand.chamber.permits.granted:
                 await self._assembly.stand.chamber.stop()
             return await self._perform(entry, notes, begun)
@@ -326,7 +279,7 @@ class Daemon:
             raise
         finally:
             self._hub.unsubscribe(follow)
-            if not self.orders.leaving:
+            if not self._orders.leaving:
                 await self._record_day()
             self.has_guest = False
             self.note()
@@ -336,7 +289,7 @@ class Daemon:
         """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
         without the record between runs. Raises as a run does, Stopped when an operator has stopped it: who presses
         stop does not want the next one to begin."""
-        orders, hub, clock = self.orders, self._hub, self._clock
+        orders, hub, clock = self._orders, self._hub, self._clock
         session = orders.directory / entry.session if entry.session else None
         if session is not None and await orders.repair.call(is_complete, session):
             return session  # killed between its end and the note of it
@@ -383,10 +336,10 @@ class Daemon:
         """What is left of its run; Halt when it cannot be resumed. What has to be written for that is written by the
         disk's process."""
         try:
-            salvaged = await self.orders.repair.call(repaired, session)
+            salvaged = await self._orders.repair.call(repaired, session)
         except SessionError as error:
             raise Halt(str(error)) from error
-        before = await self.orders.reading.call(partial(interruption_of, session, config, clear=True))
+        before = await self._orders.reading.call(partial(interruption_of, session, config, clear=True))
         return replace(before, salvaged=(*salvaged, *before.salvaged))
 
     async def _record_day(self) -> None:
@@ -404,7 +357,7 @@ class Daemon:
         """The run records, and its session is known."""
         await self._end_record()
         with suppress(SessionError):
-            await self.orders.read()
+            await self._orders.read()
 
     async def _record_behind(self) -> None:
         """The record goes on while the run that has ended is still completed; `_record_day` says when it cannot."""
@@ -422,7 +375,7 @@ class Daemon:
         kept_ns = self._clock.now_ns()
         while True:
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_LOOK_S))
-            may_begin = not (self.has_guest or self.orders.leaving)
+            may_begin = not (self.has_guest or self._orders.leaving)
             if may_begin:
                 self._status.tell(self.by_hand.doing)
             if may_begin and self.open_stand.disk is not None and (ended := self.open_stand.disk.ended):
@@ -488,12 +441,13 @@ class Daemon:
 
     async def _clear_queue(self) -> None:
         try:
-            await self.orders.clear()
+            await self._orders.clear()
         except SessionError as error:
             self._tell(QUEUE_NOT_CLEARED, str(error))
         self.wake()
 
-    def _check_heat(self) -> None:
+    def check_heat(self) -> None:
+        """As Host."""
         recorder = self.record.recorder
         if recorder is None or recorder.folder_lost or recorder.writer_ended:
             raise Conflict("nothing is recorded now, and there is no heat without a recording; see the last events")
@@ -513,10 +467,3 @@ class Daemon:
 
     def _say(self, line: str) -> None:
         self._tell(QUEUE, line)
-
-    def _tell(self, kind: EventKind, said: str = "", /, **data: object) -> None:
-        self._hub.publish(kind.at(self._clock.now_ns(), said, **data))
-
-    def _tell_failure(self, what: str, ended: asyncio.Future[object]) -> None:
-        if not ended.cancelled() and (error := ended.exception()) is not None:
-            self._tell(BY_HAND_FAILED, failure_text(error), what=what)

@@ -28,7 +28,7 @@ from thermostand.foundation.repeats import RepeatLimit
 from thermostand.recording.format.images import encode_png
 from thermostand.stand.assembly import Assembly, assemble, register_map
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.daemon.by_hand import ByHand
+from thermostand.stand.queueing.by_hand import ByHand
 from thermostand.stand.running.opening.open_stand import at_bench, made_safe
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb

@@ -115,10 +115,6 @@ class Previewer:
             jpeg=jpeg,
         )
 
-    def mean_px(self, shot: Shot) -> float | None:
-        """The length of the mean drift, for those who show no more."""
-        return self.look(shot).mean_px
-
     def _drift(self, shot: Shot, found: Detection) -> Float:
         """Of each marker, px; NaN where it is unknown."""
         if shot.role not in DRIFT_ROLES:

@@ -80,6 +80,15 @@ class Viewing:
             self._roles = {item.step_id: role} if isinstance(role, str) else {}
         self._items.append(item)
 
+    def close(self) -> None:
+        """Nothing more is taken from the hub."""
+        self._hub.unsubscribe(self._follow)
+
+    def drift_px(self) -> float | None:
+        """The mean drift in the last frame that was looked at, of the first camera that gave one."""
+        last = next(iter(self.previews.values()), None)
+        return None if last is None else last.mean_px
+
     # From here on: in the thread that serves clients.
 
     async def run(self, session: Callable[[], str]) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import queue
 import sys
 import threading
-from collections.abc import Callable, Generator
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from collections.abc import AsyncGenerator, Callable, Generator
+from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import ParamSpec
@@ -18,17 +18,21 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from thermostand.foundation.clock import NS_PER_S, Now, WallClock
+from thermostand.foundation.clock import NS_PER_S, Now, WallClock, seconds_ns, utc_offset_ns
+from thermostand.foundation.events import RUN_BEGINS
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.instants import duration, local_text
+from thermostand.foundation.items import Batch, Event, Item, StepMark
 from thermostand.foundation.output import output
 from thermostand.foundation.usage import one_line
 from thermostand.stand.estimating.run_estimate import Night
-from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import Interruption
-from thermostand.stand.watching.drift import drift_watched
-from thermostand.stand.watching.follow import Follow
-from thermostand.stand.watching.moment import Moment, free_bytes
+from thermostand.stand.gate import HELD, RELEASED
+from thermostand.stand.run import Front, by_socket
+from thermostand.stand.service import StandService
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.commands import Served
+from thermostand.stand.serving.front import front
+from thermostand.stand.watching.moment import Moment, event_line, moment_of
 
 # Output for people, written by a thread of its own: a terminal or a log that blocks delays nothing else.
 
@@ -142,6 +146,8 @@ def _minutes(duration_s: float) -> str:
 _BETWEEN_PANELS_NS = NS_PER_S // 4
 _BETWEEN_LINES_NS = 60 * NS_PER_S
 _TENTH = 0.1  # of a run in virtual time, whose minutes are none
+_LEAST_S = 1.0  # of stand time between two reports, or a thousandth of the night: terminals are slow
+_SHARE = 1e-3
 
 
 @contextmanager
@@ -156,35 +162,77 @@ def view(*, is_virtual: bool = False) -> Generator[View]:
             yield foot
 
 
+class Following:
+    """Shows a run of this process, as its service tells: messages from its hub, from the first on, and how it stands
+    from the moment on at which it answers. show, tell: make a View's calls, and keep nobody waiting."""
+
+    def __init__(
+        self,
+        show: Callable[[Moment], None],
+        tell: Callable[[str], None],
+        sessions: Path,
+        night_s: float = 0.0,
+        *,
+        tells_all: bool = False,
+    ) -> None:
+        self._show, self._tell, self._tells_all, self._sessions = show, tell, tells_all, sessions
+        self._least_ns = seconds_ns(max(_LEAST_S, _SHARE * night_s))
+        self._service: Served | None = None
+        self._drift_px: Callable[[], float | None] = lambda: None
+        self._session = ""
+        self._next_ns = 0
+
+    def watch(self, hub: Hub) -> None:
+        """From before the run begins."""
+        hub.subscribe(self._follow)
+
+    @asynccontextmanager
+    async def front(self, service: StandService, session: Path) -> AsyncGenerator[None]:
+        """Of a run in virtual time. No frame is looked at for its drift: that would take longer than the run."""
+        async with by_socket(service, session):
+            self._service = service
+            yield
+
+    def front_at(self, interface: Interface, target_text: str) -> Front:
+        """Of a run on the host's clock: all that the stand's file asks for."""
+
+        @asynccontextmanager
+        async def answering(service: StandService, session: Path) -> AsyncGenerator[None]:
+            async with front(service, session, service.stand, interface, target_text, service.patience) as viewing:
+                self._drift_px = viewing.drift_px
+                self._service = service
+                yield
+
+        return answering
+
+    def _follow(self, item: Item) -> None:
+        match item:
+            case Event():
+                self._hear(item)
+            case StepMark():
+                self._next_ns = item.time_ns
+            case Batch() if self._service is not None and item.time_ns >= self._next_ns:
+                self._next_ns = item.time_ns + self._least_ns
+                self._show(moment_of(self._service.state(), self._drift_px()))
+            case _:
+                pass
+
+    def _hear(self, event: Event) -> None:
+        if event.kind in RUN_BEGINS:
+            self._session = str(self._sessions / str(event.data.get("session")))
+        if event.kind in (HELD, RELEASED):
+            self._next_ns = event.time_ns
+        if event.level != "info" or self._tells_all:
+            offset_ns = 0 if self._service is None else utc_offset_ns(self._service.clock)
+            self._tell(event_line({**asdict(event), "utc_offset_ns": offset_ns}, self._session))
+
+
 @contextmanager
-def followed(
-    order: Order, night: Night, directory: Path, *, is_virtual: bool, before: Interruption | None = None
-) -> Generator[Callable[[Hub], None]]:
-    """What shows a run that records below `directory`, `before` having been done of it already: to be given its hub. It
-    is shown by a thread of its own, for which the run never waits. In virtual time no frame is looked at for its drift:
-    that would take longer than the run."""
-    title = f"{order.recipe.name} on {order.config.name}"
-    with (
-        view(is_virtual=is_virtual) as shown,
-        drift_watched(order.target_text, before and before.directory) as drift,
-        aside() as later,
-    ):
-
-        def show(moment: Moment) -> None:
-            shown.show(replace(moment, disk_free_bytes=free_bytes(directory), drift_px=drift.mean_px))
-
-        done, earned_s = ((), {}) if before is None else (before.kept.done, before.kept.earned_s)
-        tell_all, sessions = output().verbose, directory if before is None else before.directory.parent
-        follow = Follow(
-            title, night, later(show), later(shown.tell), done, earned_s, tell_all=tell_all, directory=sessions
-        )
-
-        def watch(hub: Hub) -> None:
-            hub.subscribe(follow)
-            if not is_virtual:
-                drift.subscribe(hub)
-
-        yield watch
+def followed(night: Night, sessions: Path, *, is_virtual: bool) -> Generator[Following]:
+    """What shows a run of this process while inside, by a thread of its own, for which the run never waits. sessions:
+    the folder of its session's."""
+    with view(is_virtual=is_virtual) as shown, aside() as later:
+        yield Following(later(shown.show), later(shown.tell), sessions, night.duration_s, tells_all=output().verbose)
 
 
 class Silent:

@@ -1,17 +1,14 @@
-"""What the watchers of a run are shown at one instant, be it from the run's own hub or from a daemon's state."""
+"""What the watchers of a stand are shown at one instant: its state as its service has it."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import cast
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.instants import local_text
-from thermostand.stand.estimating.run_estimate import existing
 from thermostand.stand.gate import IN_WORDS
 from thermostand.stand.serving.client import API, Server
 from thermostand.stand.serving.desk import StandState
@@ -64,13 +61,13 @@ class There:
 
 
 def event_line(event: EventData, session: str = "") -> str:
-    """`2026-01-01 19:00:04 CET  warning: what has happened; what to type`."""
-    time_ns, offset_ns = cast("int", event["time_ns"]), cast("int", event["utc_offset_ns"])
-    said = f"{local_text(time_ns + offset_ns)}  "
-    if event["level"] == "info":
-        return f"{said}{event['text']}"
+    """`warning: 2026-01-01 19:00:04 CET  what has happened; what to type`."""
+    time_ns, offset_ns, level = cast("int", event["time_ns"]), cast("int", event["utc_offset_ns"]), event["level"]
+    said = f"{local_text(time_ns + offset_ns)}  {event['text']}"
+    if level == "info":
+        return said
     data = cast("EventData", event.get("data") or {})
-    return f"{said}{event['level']}: {event['text']}; {next_command(str(event['kind']), data, session)}"
+    return f"{level}: {said}; {next_command(str(event['kind']), data, session)}"
 
 
 SET_POINT, AIR, CAMERA = "regulator.sp", "thermometers.air", "camera.temperature"
@@ -183,11 +180,3 @@ def held_by(reasons: Iterable[str]) -> str:
     """`held by an operator's pause`; "" when nothing holds the run."""
     causes = ", ".join(IN_WORDS.get(reason, reason) for reason in reasons)
     return f"held by {causes}" if causes else ""
-
-
-def free_bytes(directory: Path) -> int | None:
-    """On the disk of a folder that need not exist yet; None when it cannot be asked."""
-    try:
-        return shutil.disk_usage(existing(directory)).free
-    except (OSError, StopIteration):
-        return None

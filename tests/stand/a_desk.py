@@ -14,6 +14,7 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import Document
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.gate import INTERLOCK, OPERATOR, Gate
@@ -86,6 +87,14 @@ class ADesk(StandService):
         self.standing: dict[str, JsonValue] = {}
         self.requests: dict[str, tuple[RunRequest, QueuedRun]] = {}
         self.hub.publish(self.batch(21.5))
+
+    @property
+    def stand(self) -> str:
+        return STAND
+
+    @property
+    def patience(self) -> Patience:
+        return Patience()
 
     def batch(self, air_degC: float) -> Batch:
         """A poll of the thermometers, one of which is broken."""

@@ -53,7 +53,7 @@ def test_a_kind_that_is_added_is_found_everywhere(lamp: EventKind):
     assert seen == Event(5 * NS_PER_S, "warning", "lamp.broken", said, {"lamp": "lamp 2", "lit_s": 720.0})
     assert next_command(seen.kind, seen.data, "/a night") == "exchange '/a night''s lamp"
     line = event_line({**vars_of(seen), "utc_offset_ns": 0}, "/n")
-    assert line.endswith(f"warning: {said}; exchange /n's lamp")
+    assert line == f"warning: 1970-01-01 00:00:05 UTC  {said}; exchange /n's lamp"
     book = AlertBook("lab", ("device_lost",), 60 * NS_PER_S, 20)
     assert book.receive(seen, seen.time_ns) == []
     assert [each.text for each in book.due(65 * NS_PER_S)] == [said]

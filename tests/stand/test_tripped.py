@@ -31,6 +31,7 @@ from thermostand.stand.fault import Fault, Readings
 from thermostand.stand.guarding.interlocks import Watch
 from thermostand.stand.interlock import Interlocked
 from thermostand.stand.latch import UNREADABLE, state_folder
+from thermostand.stand.queueing.host import Host
 from thermostand.stand.run import run_real
 from thermostand.stand.running.opening.claim import latch_file
 from thermostand.stand.running.opening.open_stand import OpenStand
@@ -122,7 +123,7 @@ async def started(config_file: Path, folder: Path) -> AsyncGenerator[Surfaces]:
     await open_stand.latch.restore()
     open_stand.prepare()
     interface = Interface(folder, port=port, doors=(door_at(secop_port),), trusts_loopback=True)
-    async with serve(StandService(open_stand), folder / "night", config.name, interface):
+    async with serve(StandService(Host(open_stand)), folder / "night", config.name, interface):
         await asyncio.sleep(0)
         yield Surfaces(open_stand, folder / "night", server_at(f"http://127.0.0.1:{port}", None), secop_port)
     await open_stand.assembly.stand.safety.close()

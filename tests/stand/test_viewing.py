@@ -1,8 +1,6 @@
 """What the frames of a resumed run are compared with: the reference that the run had before."""
 
 import asyncio
-import threading
-import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -19,7 +17,6 @@ from thermostand.stand.serving.preview import Preview, Setup
 from thermostand.stand.serving.recorded_drift import run_references
 from thermostand.stand.serving.shot import Shot
 from thermostand.stand.serving.viewing import Viewing
-from thermostand.stand.watching.drift import drift_watched
 
 TARGET = (Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml").read_text("utf-8")
 ROLES = ("warm_up", "reference", "reference", "fit", "calibration", "reference", "fit")
@@ -56,10 +53,6 @@ class Looking:
             self._reference_ns = shot.time_ns
         setup = Setup((), 0.0, 0.0)
         return Preview(shot.camera, shot.time_ns, 6, 4, shot.role, setup, reference_ns=self._reference_ns)
-
-    def mean_px(self, shot: Shot) -> float | None:
-        """When the reference was, s after the first frame of the session."""
-        return ((self.look(shot).reference_ns or 0) - START_NS) / 1e9
 
 
 class InProcess:
@@ -135,20 +128,3 @@ async def test_a_session_that_cannot_be_read_is_reported_and_frames_are_looked_a
         assert preview.reference_ns == START_NS
         await asyncio.sleep(0)
     assert "the run's own is not found" in reported[-1]
-
-
-def test_at_the_terminal_a_resumed_runs_drift_counts_from_its_own_reference_too(
-    session: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr("thermostand.stand.watching.drift.Helper", lambda *_: InProcess())
-    monkeypatch.setattr("thermostand.stand.watching.drift.previewer", lambda _: Looking())
-    monkeypatch.setattr("thermostand.stand.watching.drift._LOOK_S", 0.01)
-    hub = Hub()
-    with drift_watched(TARGET, session) as watch:
-        watch.subscribe(hub)
-        for item in moment(START_NS + 100_000 * MS, 9, "fit"):
-            hub.publish(item)
-        end_s = time.monotonic() + 60
-        while watch.mean_px is None and time.monotonic() < end_s:
-            threading.Event().wait(0.01)
-        assert watch.mean_px == LAST_REFERENCE * 0.5

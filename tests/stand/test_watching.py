@@ -1,8 +1,10 @@
-"""What a person at the terminal sees of a run: lines and messages, from the run's own hub and from a daemon."""
+"""What a person at the terminal sees of a run, of this process and of a daemon's: lines and messages."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,21 +12,14 @@ import pytest
 from rich.console import Console
 from rich.live import Live
 
+from tests.stand.a_desk import ADesk
 from tests.stand.test_control_cli import STATUS
-from thermostand.experiments.steps import Capture, Role, Soak, number_steps
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.foundation.events import CAMERA_EQUILIBRIUM, CAMERA_EQUILIBRIUM_LOST, SOAK_LONGER
-from thermostand.foundation.items import Batch, Event, StepMark, StepState
-from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.foundation.events import RUN_START
+from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.stand.commands.control_cli import idle_lines
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.estimating.estimate import price
-from thermostand.stand.estimating.run_estimate import Night
-from thermostand.stand.running.status import doing_in_words
 from thermostand.stand.serving.desk import HeatByHand, ReadingState, StandState
-from thermostand.stand.watching.follow import Follow
-from thermostand.stand.watching.live import Foot, Lines, panel_lines, plain_line
+from thermostand.stand.watching.live import Following, Foot, Lines, panel_lines, plain_line
 from thermostand.stand.watching.moment import Moment, moment_of
 from thermostand.stand.watching.remedies import next_command
 
@@ -57,69 +52,50 @@ class SetClock:
         return self.ns
 
 
-@pytest.fixture
-def follow() -> tuple[Follow, list[Moment], list[str]]:
-    config = load_config(packaged("", "simulated"))
-    plan = number_steps([Soak(600.0), Capture(2, 1.0, 0.01, Role.FIT, 24.0)])
-    moments: list[Moment] = []
-    lines: list[str] = []
-    return Follow("a night", Night(price(plan, config)), moments.append, lines.append), moments, lines
+class Followed:
+    """A run of this process as it is shown, whose service is a desk."""
+
+    def __init__(self, folder: Path) -> None:
+        self.moments: list[Moment] = []
+        self.lines: list[str] = []
+        self.desk = ADesk(run=STATUS)
+        self.session = folder / "all nights" / "20260101T180000Z-demo"
+        self.following = Following(self.moments.append, self.lines.append, folder / "all nights")
+        self.following.watch(self.desk.hub)
+        self.desk.hub.publish(RUN_START.at(BEGIN_NS, session=self.session.name, recipe="demo", steps=2, frames=2))
+
+    def publish(self, item: Item) -> None:
+        self.desk.hub.publish(item)
 
 
-SOAK_ID = next(number_steps([Soak(600.0)])).step_id
+@asynccontextmanager
+async def followed(folder: Path, *, desk_answers: bool = True) -> AsyncGenerator[Followed]:
+    """Its service answers while inside."""
+    found = Followed(folder)
+    front = found.following.front(found.desk, found.session) if desk_answers else nullcontext()
+    async with front:
+        yield found
 
 
-def mark(seconds: float, index: int, state: StepState) -> StepMark:
-    step = (Soak(600.0), Capture(2, 1.0, 0.01, Role.FIT, 24.0))[index]
-    return StepMark(BEGIN_NS + int(seconds * NS_PER_S), str(index), index, step.kind, state, step.parameters)
+async def test_a_run_is_followed_from_the_moment_it_answers_and_before_the_next_look_when_a_step_begins(tmp_path: Path):
+    async with followed(tmp_path) as run:
+        run.publish(Batch("all", BEGIN_NS, ()))
+        assert [(each.title, each.step, each.steps) for each in run.moments] == [("thermal-cycle on a stand", 12, 87)]
+        run.publish(Batch("all", BEGIN_NS + NS_PER_S // 2, ()))
+        assert len(run.moments) == 1  # terminals are slow
+        run.desk.run = STATUS.model_copy(update={"step": 13})
+        run.publish(StepMark(BEGIN_NS + NS_PER_S // 2, "13", 13, "soak", StepState.STARTED, {}))
+        run.publish(Batch("all", BEGIN_NS + NS_PER_S // 2, ()))
+        assert [each.step for each in run.moments] == [12, 13]
 
 
-def test_a_run_is_followed_from_its_first_step_on(follow: tuple[Follow, list[Moment], list[str]]):
-    subscriber, moments, _ = follow
-    now_ns = BEGIN_NS - NS_PER_S
-    good = Reading("thermometers.air", 23.98, "degC", now_ns)
-    broken = bad_reading("camera.temperature", "degC", now_ns, "no reply")
-    subscriber(Batch("all", now_ns, (Reading("regulator.sp", 24.0, "degC", now_ns), good, broken)))
-    assert moments == []
-    subscriber(mark(0, 0, StepState.STARTED))
-    first = moments[-1]
-    assert (first.step, first.steps, first.doing, first.share) == (1, 2, "soak for 10 min", 0.0)
-    assert (first.setpoint_degC, first.air_degC, first.camera_degC) == (24.0, 23.98, None)
-    subscriber(mark(600, 0, StepState.DONE))
-    subscriber(mark(600, 1, StepState.STARTED))
-    assert moments[-1].doing == "2 frames at 24 °C (fit)"
-    assert moments[-1].share == pytest.approx(600 / 601, abs=0.01)
-    assert moments[-1].end_ns == pytest.approx(BEGIN_NS + 601 * NS_PER_S, abs=5 * NS_PER_S)
-
-
-def test_what_a_step_waits_for_is_said_with_it(follow: tuple[Follow, list[Moment], list[str]]):
-    subscriber, moments, _ = follow
-    subscriber(mark(0, 0, StepState.STARTED))
-    subscriber(Event(BEGIN_NS, "warning", CAMERA_EQUILIBRIUM_LOST, "it was off"))
-    subscriber(Batch("all", BEGIN_NS + 120 * NS_PER_S, ()))
-    again = doing_in_words("soak for 10 min", 120.0, goes_on=False)
-    assert moments[-1].doing == again != "soak for 10 min"
-    subscriber(Event(BEGIN_NS + 300 * NS_PER_S, "info", CAMERA_EQUILIBRIUM, "it is at rest"))
-    subscriber(Event(BEGIN_NS + 600 * NS_PER_S, "info", SOAK_LONGER, "", {"step_id": SOAK_ID, "by_s": 90.0}))
-    subscriber(Batch("all", BEGIN_NS + 601 * NS_PER_S, ()))
-    assert moments[-1].doing == doing_in_words("soak for 10 min", None, goes_on=True)
-    assert moments[-1].end_ns > BEGIN_NS + 690 * NS_PER_S
-    subscriber(mark(690, 1, StepState.STARTED))
-    assert moments[-1].doing == "2 frames at 24 °C (fit)"
-
-
-def test_each_warning_says_what_to_type(follow: tuple[Follow, list[Moment], list[str]]):
-    subscriber, moments, lines = follow
-    subscriber(mark(0, 0, StepState.STARTED))
-    subscriber(Event(BEGIN_NS, "info", "reported", "of no importance"))
-    subscriber(Event(BEGIN_NS, "warning", "held", "held by an operator's pause", {"reason": "operator"}))
-    subscriber(Batch("all", BEGIN_NS, ()))
-    at = UtcOffsets().local_text(BEGIN_NS)[11:]
-    assert lines == [f"warning: {at} held by an operator's pause; `stand continue` ends the pause"]
-    assert moments[-1].held == "held by an operator's pause"
-    subscriber(Event(BEGIN_NS, "info", "released", "", {"reason": "operator"}))
-    subscriber(Batch("all", BEGIN_NS, ()))
-    assert moments[-1].held == ""
+async def test_each_warning_says_what_to_type(tmp_path: Path):
+    async with followed(tmp_path) as run:
+        run.publish(Event(BEGIN_NS, "info", "reported", "of no importance"))
+        run.publish(Event(BEGIN_NS, "warning", "held", "held by an operator's pause", {"reason": "operator"}))
+    (line,) = run.lines
+    assert line.startswith("warning: 2026-01-01 1")
+    assert line.endswith(" UTC  held by an operator's pause; `stand continue` ends the pause")
 
 
 @pytest.mark.parametrize(
@@ -141,21 +117,10 @@ def test_messages_name_the_next_command(kind: str, data: dict[str, object], comm
     assert command in next_command(kind, data)
 
 
-def test_a_run_that_has_ended_early_is_resumed_by_the_name_of_its_folder(tmp_path: Path):
-    lines: list[str] = []
-    follow = Follow("a night", Night(()), lambda moment: None, lines.append, directory=tmp_path / "all nights")
-    follow(Event(BEGIN_NS, "info", "run.start", "recipe demo", {"session": "20260101T180000Z-demo"}))
-    follow(Event(BEGIN_NS, "error", "run.end", "aborted: stopped by the operator", {"status": "stopped"}))
-    assert f"`stand resume '{tmp_path}/all nights/20260101T180000Z-demo'` continues it" in lines[0]
-
-
-def test_a_terminal_that_is_gone_does_not_end_what_it_follows():
-    def gone(_: object) -> None:
-        raise BrokenPipeError
-
-    follow = Follow("a night", Night(()), gone, gone)
-    follow(Event(BEGIN_NS, "error", "guard.rule", "it is so"))
-    follow(mark(0, 0, StepState.STARTED))
+async def test_a_run_that_has_ended_early_is_resumed_by_the_name_of_its_folder(tmp_path: Path):
+    async with followed(tmp_path, desk_answers=False) as run:
+        run.publish(Event(BEGIN_NS, "error", "run.end", "aborted: stopped by the operator", {"status": "stopped"}))
+    assert f"`stand resume '{run.session}'` continues it" in run.lines[0]
 
 
 def test_the_panel_has_a_line_for_each_question():

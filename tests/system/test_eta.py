@@ -15,13 +15,11 @@ from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.estimating.estimate import price
+from thermostand.stand.estimating.eta import Eta
 from thermostand.stand.estimating.learned import learn, load_learned
-from thermostand.stand.estimating.run_estimate import Night
 from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
-from thermostand.stand.watching.follow import Follow
-from thermostand.stand.watching.moment import Moment
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 
@@ -31,7 +29,19 @@ def _aravis() -> None:
     require_aravis()
 
 
-def following(follow: Follow) -> tuple[Callable[[Hub], None], list[tuple[int, float]]]:
+def fed(eta: Eta) -> Callable[[Item], None]:
+    """A subscriber that tells it what it wants to know."""
+
+    def follow(item: Item) -> None:
+        if isinstance(item, StepMark):
+            eta.mark(item)
+        elif isinstance(item, Event):
+            eta.event(item)
+
+    return follow
+
+
+def following(eta: Eta) -> tuple[Callable[[Hub], None], list[tuple[int, float]]]:
     """A watch, and (instant, time left in s as it was shown then) each time something was published after a set-point
     was reached, that is after a dwell."""
     left: list[tuple[int, float]] = []
@@ -43,9 +53,9 @@ def following(follow: Follow) -> tuple[Callable[[Hub], None], list[tuple[int, fl
             if isinstance(item, StepMark) and item.kind.startswith("soak") and item.state is StepState.DONE:
                 reached.append(item)
             if reached and isinstance(item, Batch | StepMark):
-                left.append((item.time_ns, follow.eta.left_s(item.time_ns)))
+                left.append((item.time_ns, eta.left_s(item.time_ns)))
 
-        hub.subscribe(follow)
+        hub.subscribe(fed(eta))
         hub.subscribe(look)
 
     return watch, left
@@ -54,7 +64,7 @@ def following(follow: Follow) -> tuple[Callable[[Hub], None], list[tuple[int, fl
 async def followed(order: Order, out: Path, seed: int | None = None) -> tuple[Path, list[tuple[int, float]]]:
     """The session, and the time left as `following` has it, by what earlier runs in that folder have taught."""
     steps = price(order.recipe.plan(), order.config, load_learned(out))
-    watch, left = following(Follow("a night", Night(steps), lambda moment: None, lambda line: None))
+    watch, left = following(Eta(steps))
     return await run_virtual(order, out, seed, watch), left
 
 
@@ -103,7 +113,7 @@ async def test_the_time_left_of_a_run_that_goes_on_is_true(tmp_path: Path, order
     before = interruption(directory)
     steps = price(ordered.recipe.plan(), ordered.config)
     done, earned_s = before.kept.done, before.kept.earned_s
-    watch, left = following(Follow("a night", Night(steps), lambda moment: None, lambda line: None, done, earned_s))
+    watch, left = following(Eta(steps, done, earned_s))
     await resume(before, watch)
     assert len(left) > 100
     assert is_true(left, directory, 5.0)
@@ -132,22 +142,15 @@ async def test_the_time_left_is_true_over_the_whole_demo_night(tmp_path: Path, o
     assert worst_share(left, session) < 0.05
 
 
-def test_the_console_shows_no_time_gained_in_a_pause(order: Callable[..., Order]):
-    ordered, shown = order(), list[Moment]()
+def test_no_time_is_gained_in_a_pause(order: Callable[..., Order]):
+    ordered = order()
     steps = price(ordered.recipe.plan(), ordered.config)
-    follow = Follow("a night", Night(steps), shown.append, lambda line: None)
+    eta = Eta(steps)
+    follow = fed(eta)
     soak = next(step.planned for step in steps if isinstance(step.planned.step, Soak))
     follow(StepMark(0, soak.step_id, soak.index, "soak", StepState.STARTED))
     follow(Event(100 * NS_PER_S, "warning", "held", "", {"reason": "operator"}))
-    follow(Batch("regulator", 100 * NS_PER_S, ()))
-    left_s = follow.eta.left_s(100 * NS_PER_S)
-    follow(Batch("regulator", 4000 * NS_PER_S, ()))
-    assert follow.eta.left_s(4000 * NS_PER_S) == left_s
-    now, before = shown[-1], shown[-2]
-    assert (now.end_ns or 0) - now.now_ns == (before.end_ns or 0) - before.now_ns  # as long as at its beginning
-    assert "an operator's pause" in now.held
+    left_s = eta.left_s(100 * NS_PER_S)
+    assert eta.left_s(4000 * NS_PER_S) == left_s
     follow(Event(4000 * NS_PER_S, "info", "released", "", {"reason": "operator"}))
-    follow(Batch("regulator", 4050 * NS_PER_S, ()))
-    assert follow.eta.left_s(4050 * NS_PER_S) == left_s - 50
-    assert (shown[-1].share or 0.0) > (shown[-2].share or 0.0)
-    assert shown[-1].held == ""
+    assert eta.left_s(4050 * NS_PER_S) == left_s - 50

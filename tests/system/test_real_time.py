@@ -4,21 +4,29 @@ import asyncio
 import os
 import signal
 import sys
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
-from tests.addresses import camera_address
+from tests.addresses import camera_address, free_port
+from tests.stand.secop_talk import talking
 from tests.system.conftest import CORNER, FAST, require_aravis
-from thermostand.foundation.errors import Unreachable
+from thermostand.foundation.errors import SessionError, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark
 from thermostand.recording.reading.session import Session
+from thermostand.stand.config.interface_section import InterfaceConfig
 from thermostand.stand.run import Interrupted, run_real
 from thermostand.stand.running.order import Order
+from thermostand.stand.serving.client import API, server_at
+from thermostand.stand.serving.front import interface_of
 from thermostand.stand.simulator import ControlSocket
+from thermostand.stand.watching.live import Following
+from thermostand.stand.watching.moment import Moment
 
 BRIEF = """
 name: brief
@@ -89,6 +97,38 @@ async def test_an_interrupt_leaves_the_stand_safe_and_the_session_readable(
     assert session.readings("regulator.running")[1][-1] == 0
     assert session.readings("relays.heater_enable")[1][-1] == 0
     assert any("stopped by the operator" in event.text for event in session.events())
+
+
+async def test_a_run_by_itself_has_the_page_and_secop_of_its_file_and_either_stops_it(
+    tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
+):
+    ordered = order(BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600"), **FAST)
+    await asyncio.to_thread(simulator, ordered.config, False)
+    ports = InterfaceConfig(port=free_port(), secop_port=free_port())
+    config = ordered.config.model_copy(update={"interface": ports})
+    lines, moments, out = list[str](), list[Moment](), tmp_path / "out"
+    shown = Following(moments.append, lines.append, out)
+    front = shown.front_at(interface_of(config, out), ordered.target_text)
+    run = asyncio.create_task(run_real(ordered, out, shown.watch, front=front))
+    there = server_at(f"http://127.0.0.1:{ports.port}")
+    async with asyncio.timeout(60.0):
+        while not moments:
+            await asyncio.sleep(0.1)
+    state = await asyncio.to_thread(there.state)
+    assert [(each.recipe, each.state) for each in state.queue] == [("brief", "running")]
+    devices = cast("list[dict[str, str]]", await asyncio.to_thread(there.request, "GET", f"{API}/devices"))
+    assert all(each["refused"] for each in devices)
+    with pytest.raises(SessionError, match="kept"):
+        await asyncio.to_thread(there.request, "POST", f"{API}/queue", {"recipe": "demo"})
+    with urllib.request.urlopen(f"http://127.0.0.1:{ports.port}/") as page:
+        assert b"thermostand" in page.read()
+    async with talking(ports.secop_port or 0) as talk:
+        assert (await talk.asked("read run:_recipe"))[2][0] == "brief"
+        assert (await talk.asked("do run:stop"))[0] == "done"
+    with pytest.raises(Interrupted):
+        await run
+    assert (moments[-1].title, lines[-1].partition(":")[0]) == ("brief on simulated-stand", "error")
+    assert Session.open(next(path for path in out.iterdir() if path.is_dir())).readings("regulator.running")[1][-1] == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])

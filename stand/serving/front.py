@@ -1,0 +1,60 @@
+"""How whoever has a stand open answers its clients: commands, stream, page and SECoP, as the stand's file has it."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from thermostand.foundation.patience import Patience
+from thermostand.stand.config.interface_section import load_tokens
+from thermostand.stand.config.stand_config import StandConfig
+from thermostand.stand.serving.api.access import TokenBook
+from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.server import serve, try_doors
+from thermostand.stand.serving.commands import Served
+from thermostand.stand.serving.secop.door import door_at
+from thermostand.stand.serving.viewing import Viewing
+
+HERE = "127.0.0.1"
+
+
+def interface_of(
+    config: StandConfig, sessions: Path, host: str = HERE, port: int | None = None, secop: int | None = None
+) -> Interface:
+    """As the stand's file has it, but for the ports that are given. ConfigError when the network could operate the
+    stand without a token, or nobody can listen there: before a device is opened."""
+    settings = config.interface
+    trusts, port = settings.trust_loopback, settings.port if port is None else port
+    secop = settings.secop_port if secop is None else secop
+    book = TokenBook(None if settings.secrets is None else load_tokens(settings.secrets))
+    doors = () if secop is None else (door_at(secop, read_only=trusts == "read-only"),)
+    found = Interface(sessions, host, port, book, settings.hosts, trusts_loopback=trusts, doors=doors)
+    found.check()
+    try_doors(found)
+    return found
+
+
+@asynccontextmanager
+async def front(
+    service: Served, session: Path, stand: str, interface: Interface, target_text: str, patience: Patience
+) -> AsyncGenerator[Viewing]:
+    """Answer for who runs `session`, as `serve`, with the page and what it shows of frames."""
+    viewing = Viewing(service.hub, service.clock, interface.sessions, target_text)
+    try:
+        async with serve(service, session, stand, replace(interface, rooms=(_page(viewing),)), patience):
+            yield viewing
+    finally:
+        viewing.close()
+
+
+def _page(viewing: Viewing) -> Callable[[Bridge], Any]:
+    def room(bridge: Bridge) -> Any:
+        from thermostand.stand.serving.page_room import PageRoom  # FastAPI, which the thread loads that serves clients
+
+        return PageRoom(viewing)(bridge)
+
+    return room
