@@ -148,13 +148,13 @@ class StandService(Served):
     def __init__(self, host: Host) -> None:
         assembly = host.open_stand.assembly
         super().__init__(assembly.hub, assembly.clock)
-        self._host = host
+        self.host = host
         self._open_stand = host.open_stand
         self._assembly = assembly
 
     def state(self) -> StandState:
         """As it is now."""
-        assembly, run, host = self._assembly, self._run, self._host
+        assembly, run, host = self._assembly, self._run, self.host
         changes = host.seen()
         if run is not None:
             changes.update(run.seen())
@@ -175,7 +175,7 @@ class StandService(Served):
 
     def devices(self) -> tuple[DeviceState, ...]:
         """The commands that devices take by hand, between runs."""
-        return self._host.devices()
+        return self.host.devices()
 
     async def known_faults(self) -> SimulatedFaults:
         """Of the simulated laboratory."""
@@ -196,8 +196,8 @@ class StandService(Served):
 
         Example: stand stop
         """
-        self._host.stop()
-        return "the stand is made safe" + ("" if self._host.guest is None else ", and the run ends")
+        self.host.stop()
+        return "the stand is made safe" + ("" if self.host.guest is None else ", and the run ends")
 
     @command("/run/pause")
     def pause(self, who: Who, given: PauseRequest) -> str:
@@ -226,7 +226,7 @@ class StandService(Served):
     @command("/run/clear", verbs=())
     def clear(self, who: Who) -> str:
         """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
-        host, orders = self._host, self._host.orders
+        host, orders = self.host, self.host.orders
         if self._open_stand.latch.fault is None and (orders is None or not orders.queued.halted):
             raise Conflict(f"there is nothing to clear: no interlock holds this {'run' if orders is None else 'stand'}")
         still = self._open_stand.clear()
@@ -274,7 +274,7 @@ class StandService(Served):
         """
         orders, order = self._orders(), RunRequest.model_validate(given.model_dump(exclude={"key"}))
         entry = await orders.submit(who, order, given.key)
-        self._host.wake()
+        self.host.wake()
         return orders.shown_run(entry)
 
     @command("/queue/{run}", http="DELETE", verbs=("queue remove",), title="Remove")
@@ -284,7 +284,7 @@ class StandService(Served):
         Example: stand queue remove 5
         """
         await self._orders().cancel(given.run)
-        self._host.wake()
+        self.host.wake()
         return f"run {given.run} is out of the queue"
 
     @command("/queue/{run}/move", verbs=("queue move",))
@@ -303,14 +303,14 @@ class StandService(Served):
         if self._open_stand.latch.fault is not None:
             raise Conflict("the stand has tripped; clear it first")
         entry = await orders.resume(given.session)
-        self._host.wake()
+        self.host.wake()
         return f"run {entry.id} is resumed next"
 
     @command("/devices/{device}/{verb}", verbs=())
     async def device(self, who: Who, given: DeviceRequest) -> str:
         """Tell a device something between runs, through the same gate as a run. What takes longer than a moment goes on
         when this is answered, and its failure is an event."""
-        return await self._host.do_by_hand(given.device, given.verb, given.arguments)
+        return await self.host.do_by_hand(given.device, given.verb, given.arguments)
 
     @command("/sessions/{session}/notes", verbs=(), by_secop=None)
     async def note(self, who: Who, given: NoteRequest) -> str:
@@ -341,7 +341,7 @@ class StandService(Served):
     @property
     def _run(self) -> Course | None:
         """Of the run that has the stand, once it can be asked anything."""
-        guest = self._host.guest
+        guest = self.host.guest
         return None if guest is None else guest.course
 
     def _running(self) -> Course:
@@ -362,13 +362,13 @@ class StandService(Served):
         return run, found[0]
 
     def _orders(self) -> Orders:
-        if self._host.orders is None:
+        if self.host.orders is None:
             raise Conflict(_NO_QUEUE)
-        return self._host.orders
+        return self.host.orders
 
     async def _notes_of(self, session: str) -> tuple[Path, DiskCalls]:
         """The folder of a session, and what writes its file of notes."""
-        if (orders := self._host.orders) is not None:
+        if (orders := self.host.orders) is not None:
             return await orders.reading.call(orders.folder_of, session), orders.notes
         run = self._running()
         if session != run.directory.name:

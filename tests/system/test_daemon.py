@@ -12,6 +12,7 @@ import time
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -27,6 +28,7 @@ from thermostand.recording.reading.notes import read_notes
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.daemon.daemon import Daemon
 from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.guest import Guest
 from thermostand.stand.service import DeviceRequest, StandService, SubmitRequest
@@ -398,7 +400,7 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
 
     @asynccontextmanager
     async def front(desk: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
-        daemon = getattr(desk, "_daemon")  # noqa: B009 - what only a test may ask for
+        daemon = cast("Daemon", desk.host)
 
         async def work() -> None:
             telling = asyncio.create_task(tell(hub, clock))

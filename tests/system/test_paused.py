@@ -25,7 +25,8 @@ def service_of(assembly: Assembly) -> StandService:
     """Of a run of which only the stand is asked."""
     log, nothing = Logbook(assembly.hub, assembly.clock, fold((), ())), cast("Any", None)
     course = Course(assembly, Path("session"), Stop(), log, nothing, nothing, nothing)
-    return StandService(cast("Any", SimpleNamespace(assembly=assembly, guest=SimpleNamespace(course=course))))
+    guest, open_stand = SimpleNamespace(course=course), SimpleNamespace(assembly=assembly)
+    return StandService(cast("Any", SimpleNamespace(open_stand=open_stand, guest=guest)))
 
 
 def paused(service: StandService) -> tuple[tuple[str, ...], tuple[str, ...]]:
