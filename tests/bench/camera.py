@@ -13,12 +13,10 @@ import time
 from pathlib import Path
 
 from tests.bench.fakes import fakes
-from tests.bench.figures import Figure, progress, side_by_side, skipped
+from tests.bench.figures import Figure, progress, require_aravis, side_by_side
 from thermostand.drivers.devices.cameras.camera_gige import Camera
-from thermostand.drivers.framing.aravis_library import library
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
 from thermostand.foundation.clock import WallClock
-from thermostand.foundation.errors import StandError
 
 ROUNDS = 5
 FRAMES = 8  # in one measurement
@@ -33,10 +31,7 @@ LEADER_AND_TRAILER = 2
 def figures(directory: Path) -> list[Figure]:
     """One figure for each pace."""
     what = "camera, software trigger, 5 MP"
-    try:
-        library()
-    except StandError as error:
-        return [skipped(what, error)]
+    require_aravis()
     return [_at_pace(what, pace_MBps) for pace_MBps in PACES_MBps]
 
 

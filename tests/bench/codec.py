@@ -1,15 +1,12 @@
-"""What a frame costs as a chunk: processor time and size, beside OpenCV's PNG and the entropy of the noise.
+"""What a frame costs as a chunk: processor time and size, beside OpenCV's PNG.
 
-The frames are 5 MP of the target in uneven light with Gaussian noise of a known sigma, and one of the simulator's. No
-lossless codec can spend less than the entropy of the rounded noise, even if it knew the noise-free image. Times are of
-the processor, so that other programs of the machine count less; OpenCV has one thread.
+The frames are 5 MP of the target in uneven light with Gaussian noise of a known sigma, and one of the simulator's.
+Times are of one thread of the processor, so that other programs of the machine count less.
 """
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,7 @@ import numpy as np
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side
+from tests.bench.figures import Figure, absolute, in_turns, processor_ms, progress, side_by_side
 from tests.compensation.rendered import Scene, render, shaded_light
 from tests.recording.stored import stored
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
@@ -37,9 +34,6 @@ from thermostand.stand.config.stand_config import packaged
 
 ROUNDS = 11
 START_NS = 1_767_290_400 * NS_PER_S
-SIGMAS_DN = (1.0, 1.5, 2.0)
-SIGMAS_12_BIT_DN = (3.0, 24.0)  # the second is 1.5 DN of 8 bit
-LIMIT = "entropy of the noise"
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Float = NDArray[np.float64]
@@ -57,8 +51,6 @@ def figures(directory: Path) -> list[Figure]:
             *_costs("8 bit", noisy(clean, 1.5, np.uint8, 1)),
             *_costs("8 bit of the demo", simulated),
             *_costs("12 bit, noise 24 DN", noisy(clean * 16, 24.0, np.uint16, 1)),
-            *(_of_limit("8 bit", noisy(clean, sigma_DN, np.uint8, 1), sigma_DN) for sigma_DN in SIGMAS_DN),
-            *(_of_limit("12 bit", noisy(clean * 16, sigma, np.uint16, 1), sigma) for sigma in SIGMAS_12_BIT_DN),
             *_roi(clean),
         ]
 
@@ -68,14 +60,6 @@ def noisy(clean_DN: Float, sigma_DN: float, dtype: type[np.uint8] | type[np.uint
     rng = np.random.default_rng(seed)
     noisy: Any = np.round(clean_DN + rng.normal(0, sigma_DN, clean_DN.shape)).astype(dtype)
     return noisy
-
-
-def rounded_noise_bit(sigma_DN: float) -> float:
-    """Entropy of Gaussian noise rounded to whole DN, bit per pixel; from sigma 1 on it is the same wherever between
-    two whole values the mean lies."""
-    reach = math.ceil(10 * sigma_DN)
-    edges = [0.5 * math.erfc(-(k - 0.5) / sigma_DN / math.sqrt(2)) for k in range(-reach, reach + 2)]
-    return -sum(part * math.log2(part) for part in np.diff(edges).tolist() if part > 0)
 
 
 def chunk_of(frame: Frame) -> bytes:
@@ -99,11 +83,13 @@ def _costs(what: str, image: Image) -> list[Figure]:
     progress(f"codec, {what}")
     chunk, (_, png) = chunk_of(_frame(image)), cv2.imencode(".png", image)
     into = in_turns(
-        lambda: _cpu_ms(lambda: chunk_of(_frame(image))), lambda: _cpu_ms(lambda: cv2.imencode(".png", image)), ROUNDS
+        lambda: processor_ms(lambda: chunk_of(_frame(image))),
+        lambda: processor_ms(lambda: cv2.imencode(".png", image)),
+        ROUNDS,
     )
     out_of = in_turns(
-        lambda: _cpu_ms(lambda: image_in(chunk)),
-        lambda: _cpu_ms(lambda: cv2.imdecode(png, cv2.IMREAD_UNCHANGED)),
+        lambda: processor_ms(lambda: image_in(chunk)),
+        lambda: processor_ms(lambda: cv2.imdecode(png, cv2.IMREAD_UNCHANGED)),
         ROUNDS,
     )
     return [
@@ -111,13 +97,6 @@ def _costs(what: str, image: Image) -> list[Figure]:
         side_by_side("  out of it, whole", "CPU ms", "cv2 default PNG", *out_of),
         side_by_side("  its size", "MB", "cv2 default PNG", [len(chunk) / 1e6], [len(png) / 1e6]),
     ]
-
-
-def _of_limit(what: str, image: Image, sigma_DN: float) -> Figure:
-    """How many times smaller the chunk is than the image, and may be."""
-    ratio = image.nbytes / len(chunk_of(_frame(image)))
-    limit = 8 * image.itemsize / rounded_noise_bit(sigma_DN)
-    return side_by_side(f"frame, {what}, noise {sigma_DN:g} DN", ": 1", LIMIT, [ratio], [limit])
 
 
 def _roi(clean: Float) -> list[Figure]:
@@ -128,11 +107,11 @@ def _roi(clean: Float) -> list[Figure]:
     whole, frame = chunk_of(keep(_frame(first))), _frame(image)
     partial = chunk_of(keep(frame))
     own, other = in_turns(
-        lambda: _cpu_ms(lambda: chunk_of(keep(frame))), lambda: _cpu_ms(lambda: chunk_of(frame)), ROUNDS
+        lambda: processor_ms(lambda: chunk_of(keep(frame))), lambda: processor_ms(lambda: chunk_of(frame)), ROUNDS
     )
     ratios = [image.nbytes / len(partial)], [image.nbytes / len(whole)]
-    search_ms = [_cpu_ms(lambda: marker_windows(image, target)) for _ in range(5)]
-    decode_ms = [_cpu_ms(lambda: image_in(partial)) for _ in range(5)]
+    search_ms = [processor_ms(lambda: marker_windows(image, target)) for _ in range(5)]
+    decode_ms = [processor_ms(lambda: image_in(partial)) for _ in range(5)]
     return [
         side_by_side("roi, 5 MP with 54 windows into a chunk", "CPU ms", "whole frame", own, other),
         side_by_side("roi, ratio, noise 1.5 DN", ": 1", "whole frame", *ratios),
@@ -143,12 +122,6 @@ def _roi(clean: Float) -> list[Figure]:
 
 def _frame(image: Image) -> Frame:
     return Frame("camera.image", image, START_NS, 0.1, 0.0, 40.0, 1, 1)
-
-
-def _cpu_ms(work: Callable[[], object]) -> float:
-    begin_s = time.process_time()
-    work()
-    return 1e3 * (time.process_time() - begin_s)
 
 
 @contextmanager

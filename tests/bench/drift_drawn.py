@@ -13,6 +13,7 @@ from tests.compensation.drawn_nights import Night, cycle, full_night, night, ref
 from thermostand.compensation.drift.choosing import FORMS, fit
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.observations import Float
 from thermostand.experiments.steps import Role
 
 CAMERAS = 20
@@ -23,14 +24,13 @@ _SIGMA_95 = 1.959964
 
 @dataclass(frozen=True)
 class Score:
-    """rms_mpx: of both coordinates of what compensation leaves of the truth at held-out temperatures. covered,
-    unflagged: shares of these deviations in the 95 % interval, and without a flag; claimed_mpx: RMS of what is
-    claimed."""
+    """rms_mpx: of both coordinates of what compensation leaves of the truth. covered, unflagged: shares of these
+    deviations in the 95 % interval, and without a flag; covered_unflagged: the former of the latter."""
 
     rms_mpx: float
     covered: float
     unflagged: float
-    claimed_mpx: float
+    covered_unflagged: float
 
 
 def effects_of(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], str]:
@@ -49,10 +49,11 @@ def drawn_night(seed: int, *, unrepeating: bool) -> Night:
     return night(drawn_camera(seed, *names), parts, seed, unrecorded=unrecorded)
 
 
-def score(model: DriftModel, made: Night, role: str = Role.VALIDATION) -> Score:
-    """Of the deviations from the truth's own reference, without the noise of single frames."""
+def score(model: DriftModel, made: Night, role: str = Role.VALIDATION, reference_px: Float | None = None) -> Score:
+    """Of the deviations from the truth's own reference, unless another is given, without the noise of single frames."""
     observed, truth = made.observed, made.truth_px
-    reference_px = truth[observed.of(Role.REFERENCE)].mean(axis=0)
+    if reference_px is None:
+        reference_px = truth[observed.of(Role.REFERENCE)].mean(axis=0)
     states = frame_states(observed, model.memory)
     model = model.of_sessions(one.session_id for one in observed.sessions)
     left, claimed, flags = [], [], []
@@ -61,14 +62,11 @@ def score(model: DriftModel, made: Night, role: str = Role.VALIDATION) -> Score:
         left.append(reference_px - model.correct(truth[frame], state))
         claimed.append(np.diagonal(model.covariance(truth[frame], state), axis1=1, axis2=2))
         flags.append(model.flags(truth[frame], state))
-    deviations, variances = np.array(left), np.array(claimed)
-    covered = np.abs(deviations) <= _SIGMA_95 * np.sqrt(variances)
-    return Score(
-        1e3 * float(np.sqrt(np.mean(deviations**2))),
-        float(covered.mean()),
-        float((np.array(flags) == 0).mean()),
-        1e3 * float(np.sqrt(variances.mean())),
-    )
+    deviations, clear = np.array(left), np.array(flags) == 0
+    holds = np.abs(deviations) <= _SIGMA_95 * np.sqrt(np.array(claimed))
+    covered_unflagged = float(holds[clear].mean()) if clear.any() else float("nan")
+    rms_mpx = 1e3 * float(np.sqrt(np.mean(deviations**2)))
+    return Score(rms_mpx, float(holds.mean()), float(clear.mean()), covered_unflagged)
 
 
 def figures() -> Iterator[Figure]:

@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.drivers.sim.gige.camera import FakeCamera, HEIGHT_px, WIDTH_px
-from thermostand.drivers.sim.motion.ximc import FakeAxis
-from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine
 from thermostand.drivers.sim.units.regulator import FakeRegulator
@@ -52,13 +50,6 @@ def modbus(ours: str, other: str) -> tuple[str, list[Close]]:
     return str(tcp.port), [tcp.close, *(pty.close for pty in ptys)]
 
 
-def ximc(ours: str, other: str) -> tuple[str, list[Close]]:
-    """One linear stage at the ends of two serial wires."""
-    clock = WallClock()
-    axis = FakeAxis(Plant(PlantSpec(), clock.now_ns()), clock, LINEAR_8MT160_300, 0x1234, "linear")
-    return "ready", [PtyWire(Path(path), axis.engine(), LinkFaults()).close for path in (ours, other)]
-
-
 def camera(address: str, serial_number: str, pace_MBps: str) -> tuple[str, list[Close]]:
     """A camera whose image costs nothing and leaves at once when it is triggered, as in virtual time."""
     clock = WallClock()
@@ -75,7 +66,7 @@ def camera(address: str, serial_number: str, pace_MBps: str) -> tuple[str, list[
 
 def main() -> None:
     """Build, tell, wait, close."""
-    build = {"modbus": modbus, "ximc": ximc, "camera": camera}[sys.argv[1]]
+    build = {"modbus": modbus, "camera": camera}[sys.argv[1]]
     line, closers = build(*sys.argv[2:])
     sys.stdout.write(line + "\n")
     sys.stdout.flush()

@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import math
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+
+from thermostand.drivers.framing.aravis_library import library
+from thermostand.foundation.errors import StandError
 
 Measurement = Callable[[], float]
 
@@ -102,6 +107,31 @@ def per_second(work: Callable[[], object], count: int) -> float:
 def milliseconds(work: Callable[[], object]) -> float:
     """How long `work` takes once, ms."""
     return 1e3 / per_second(work, 1)
+
+
+def processor_ms(work: Callable[[], object]) -> float:
+    """What `work` takes of one core once, ms; other programs on the machine do not count."""
+    begin_s = time.thread_time()
+    work()
+    return 1e3 * (time.thread_time() - begin_s)
+
+
+def process_ms(*words: str | Path) -> float:
+    """How long a process of Python's takes, from its start to its end, ms."""
+    command = [sys.executable, *map(str, words)]
+    return milliseconds(lambda: subprocess.run(command, stdout=subprocess.DEVNULL, check=True))
+
+
+class Missing(Exception):
+    """What a benchmark needs is not here; the table says so."""
+
+
+def require_aravis() -> None:
+    """Missing without the library that drives cameras."""
+    try:
+        library()
+    except StandError as error:
+        raise Missing(str(error)) from error
 
 
 def progress(text: str) -> None:

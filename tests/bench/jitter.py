@@ -14,15 +14,13 @@ import statistics
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
-from tests.bench.figures import Figure, at_most, progress, skipped
+from tests.bench.figures import Figure, at_most, progress, require_aravis, skipped
 from tests.bench.waiting import beside, p99, waiting
 from tests.system.simulated_orders import simulated_order
-from thermostand.drivers.framing.aravis_library import library
 from thermostand.drivers.wires.camera_connection import Connection, Shot
 from thermostand.foundation.clock import WallClock, seconds_ns
-from thermostand.foundation.errors import StandError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
@@ -48,10 +46,7 @@ experiments:
 def figures(directory: Path) -> list[Figure]:
     """99th percentile of the deviation from the grid, ms."""
     what = f"frame schedule at {1 / INTERVAL_s:g} fps, deviation"
-    try:
-        library()
-    except StandError as error:
-        return [skipped(what, error)]
+    require_aravis()
     progress(f"{FRAMES} frames in real time")
     order = simulated_order(directory, RECIPE, poll_s=1.0)
     with laboratory(order):
@@ -63,9 +58,10 @@ def figures(directory: Path) -> list[Figure]:
 def laboratory(order: Order) -> Generator[None]:
     """The simulated one of the order, in real time; its camera renders one picture and shows it from then on."""
     described = laboratory_of(order.config, virtual=False, seed=None)
-    cameras = cast("dict[str, dict[str, object]]", described["cameras"])
-    for camera in cameras.values():
-        camera["still"] = True
+    devices = cast("dict[str, dict[str, Any]]", described["devices"])
+    for device in devices.values():
+        if device["fake"] == "cameras":
+            device["settings"]["still"] = True
     simulator = Simulator(described)
     try:
         yield

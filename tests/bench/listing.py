@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import resource
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
-from tests.bench.figures import Figure, Measurement, absolute, at_most, in_turns, milliseconds, side_by_side
+from tests.bench.figures import Figure, Measurement, absolute, at_most, in_turns, process_ms, side_by_side
 from tests.recording.runs import record_run
 
 SESSIONS = 1000
@@ -28,9 +26,8 @@ def sessions(folder: Path, count: int = SESSIONS) -> Path:
 
 
 def listed(folder: Path) -> Measurement:
-    """A process of its own, from its start to its end, ms."""
-    command = [sys.executable, "-m", "thermostand.stand.cli", "session", "list", str(folder)]
-    return lambda: milliseconds(lambda: subprocess.run(command, capture_output=True, check=True))
+    """ms of the command."""
+    return lambda: process_ms("-m", "thermostand.stand.cli", "session", "list", folder)
 
 
 def figures(folder: Path) -> list[Figure]:

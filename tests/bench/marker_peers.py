@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Sequence
 
 import cv2
@@ -18,7 +17,6 @@ Peer = Callable[[Image], Float | None]
 STRONGEST = "SimpleBlob, step 2"
 COMMON = "findCirclesGrid, defaults"
 _LEAST_AREA_px2 = 300
-_LEVEL_DN = 115
 
 
 def opencv_peers(target: Target) -> dict[str, Peer]:
@@ -31,13 +29,6 @@ def opencv_peers(target: Target) -> dict[str, Peer]:
         "findCirclesGrid, tuned": lambda image: _grid(image, size, _blobs(40, 180, 20)),
         STRONGEST: lambda image: _centres(_blobs(35, 185, 2).detect(image)),
     }
-
-
-def scikit_image_peers() -> dict[str, Peer]:
-    """Weighted centroids of labelled regions, and ellipses through contours; none where it is not installed."""
-    if importlib.util.find_spec("skimage") is None:
-        return {}
-    return {"scikit-image regionprops": _regions, "scikit-image find_contours": _contours}
 
 
 def _blobs(lowest_DN: float, highest_DN: float, step_DN: float) -> cv2.SimpleBlobDetector:
@@ -55,21 +46,3 @@ def _grid(image: Image, size: tuple[int, int], detector: cv2.SimpleBlobDetector)
 
 def _centres(keypoints: Sequence[cv2.KeyPoint]) -> Float:
     return np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
-
-
-def _regions(image: Image) -> Float:
-    from skimage.measure import label, regionprops  # pyright: ignore[reportMissingImports] - a peer for the bench only
-
-    found = regionprops(label(image < _LEVEL_DN), intensity_image=np.float64(image.max()) - image)
-    return np.array([one.centroid_weighted[::-1] for one in found if one.area >= _LEAST_AREA_px2]).reshape(-1, 2)
-
-
-def _contours(image: Image) -> Float:
-    from skimage.measure import EllipseModel, find_contours  # pyright: ignore[reportMissingImports] - as above
-
-    centres: list[tuple[float, float]] = []
-    for contour in find_contours(image.astype(np.float64), _LEVEL_DN):
-        ellipse = EllipseModel()
-        if len(contour) ** 2 >= 4 * np.pi * _LEAST_AREA_px2 and ellipse.estimate(contour[:, ::-1]):
-            centres.append((ellipse.params[0], ellipse.params[1]))
-    return np.array(centres, dtype=np.float64).reshape(-1, 2)

@@ -8,7 +8,6 @@ each scene. Times are of one thread.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +20,13 @@ from tests.bench.figures import (
     absolute,
     at_most,
     in_turns,
+    processor_ms,
     progress,
     ratio_at_most,
     side_by_side,
     skipped,
 )
-from tests.bench.marker_peers import COMMON, STRONGEST, Float, Image, Peer, opencv_peers, scikit_image_peers
+from tests.bench.marker_peers import COMMON, STRONGEST, Float, Image, Peer, opencv_peers
 from tests.compensation.rendered import Scene, photograph, project, render, shaded_light, true_centres_px
 from thermostand.markers.detection import Detection, Flag, Noise, detect
 from thermostand.markers.eccentricity import disc_centres_px
@@ -102,7 +102,7 @@ def figures(directory: Path) -> list[Figure]:
     """ms for a first and for a tracked frame, then the errors of each scene, ours and the peers'."""
     cv2.setNumThreads(1)
     target = load_target(packaged("targets", "paper-9x6"))
-    peers = opencv_peers(target) | scikit_image_peers()
+    peers = opencv_peers(target)
     lines: list[Figure] = []
     for name, case in CASES.items():
         progress(f"markers, scene {name}")
@@ -119,36 +119,19 @@ def figures(directory: Path) -> list[Figure]:
             lines += _limits(name, case, clean, found, truth, target)
             lines.append(_discs(name, case, found, target))
         lines += _beside(name, case, images, found, truth, peers)
-    if not scikit_image_peers():
-        lines.append(skipped("markers, scikit-image", "it is not installed"))
     return lines
-
-
-def _processor_ms(work: Callable[[], object]) -> list[float]:
-    """What `work` takes of one core, ms; other programs on the machine do not count."""
-    work()
-    times_ms: list[float] = []
-    for _ in range(2 * ROUNDS):
-        times_ms.append(_thread_ms(work))
-    return times_ms
-
-
-def _thread_ms(work: Callable[[], object]) -> float:
-    begin_s = time.thread_time()
-    work()
-    return 1e3 * (time.thread_time() - begin_s)
 
 
 def _times(images: list[Image], target: Target, peers: dict[str, Peer]) -> list[Figure]:
     previous = detect(images[0], target)
     lines: list[Figure] = []
     for what, before, goal_ms in (("first", None, 15), ("tracked", previous, 3)):
-        own_ms = _processor_ms(lambda before=before: detect(images[1], target, before))
-        lines.append(at_most(goal_ms, absolute(f"markers, {what} 5 MP frame, one core", "ms", own_ms)))
+        own_ms = [processor_ms(lambda before=before: detect(images[1], target, before)) for _ in range(2 * ROUNDS + 1)]
+        lines.append(at_most(goal_ms, absolute(f"markers, {what} 5 MP frame, one core", "ms", own_ms[1:])))
         for peer, search in peers.items():
             own, other = in_turns(
-                lambda before=before: _thread_ms(lambda: detect(images[1], target, before)),
-                lambda search=search: _thread_ms(lambda: search(images[1])),
+                lambda before=before: processor_ms(lambda: detect(images[1], target, before)),
+                lambda search=search: processor_ms(lambda: search(images[1])),
                 ROUNDS,
             )
             beside = side_by_side(f"markers, {what} 5 MP frame, one core", "ms", peer, own, other)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.bench.figures import Figure, at_least, at_most, progress, skipped
+from tests.bench.figures import Figure, at_least, at_most, progress, require_aravis
 from tests.system.protocol_night import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes
 from tests.system.simulated_orders import simulated_order
-from thermostand.drivers.framing.aravis_library import library
-from thermostand.foundation.errors import StandError
 
 BRIEF_PROTOCOL = PROTOCOL.replace("2700", "300").replace("cycles: 2", "reference_frames: 2")
 REPEATS = 3
@@ -17,10 +15,7 @@ SPEED_GOAL = 1000  # times real time
 
 def figures(directory: Path) -> list[Figure]:
     """Wall time and memory of the whole protocol; how many of three brief ones are the same to the byte."""
-    try:
-        library()
-    except StandError as error:
-        return [skipped("the paper's protocol at 1 Hz", error)]
+    require_aravis()
     progress(f"{REPEATS} runs of the protocol with brief dwells")
     brief = outcomes(simulated_order(directory, BRIEF_PROTOCOL, POLL_s), directory, REPEATS)
     same = sum(outcome.digest == brief[0].digest for outcome in brief)

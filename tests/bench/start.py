@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
-from tests.bench.figures import Figure, Measurement, in_turns, milliseconds, ratio_at_most, side_by_side
+from tests.bench.figures import Figure, in_turns, process_ms, ratio_at_most, side_by_side
 
 ROUNDS = 5
 PEER = ("-c", "import numpy, google.protobuf, mcap")
@@ -20,16 +17,10 @@ OURS = {
 MOST = 2.0  # 0.3 s where the peer takes 0.15 s
 
 
-def started(words: Sequence[str]) -> Measurement:
-    """A process of its own, from its start to its end, ms."""
-    command = [sys.executable, *words]
-    return lambda: milliseconds(lambda: subprocess.run(command, stdout=subprocess.DEVNULL, check=True))
-
-
 def figures(folder: Path) -> list[Figure]:
     """Each beside the import of numpy, protobuf and mcap."""
     found: list[Figure] = []
     for what, words in OURS.items():
-        ours, others = in_turns(started(words), started(PEER), ROUNDS)
+        ours, others = in_turns(lambda words=words: process_ms(*words), lambda: process_ms(*PEER), ROUNDS)
         found.append(ratio_at_most(MOST, side_by_side(what, "ms", "import numpy, google.protobuf, mcap", ours, others)))
     return found

@@ -17,13 +17,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tests.bench.figures import Figure, at_most, progress
-from tests.bench.viewers import FOLLOW, VIEWERS
+from tests.bench.viewers import VIEWERS, followed
 from tests.bench.waiting import beside, p99, waiting
 from tests.stand import floods
 from tests.stand.test_interface_access import free_port
 from thermostand.foundation.errors import SessionError
 from thermostand.stand.serving.client import Server, server_of
-from thermostand.stand.serving.presence import living
 
 STOPS, FLOODED_STOPS = 200, 10
 LIMIT_ms, FLOODED_LIMIT_ms = 20.0, 1000.0
@@ -64,7 +63,7 @@ def figures(directory: Path) -> list[Figure]:
         local.state(30.0)  # everything is imported
         ways = {"over TCP": remote, "by `stand stop`": local}
         found += _side(ways, "alone")
-        with _followed(session):
+        with followed(session):
             time.sleep(2.0)
             found += _side(ways, f"{VIEWERS} viewers")
         for name in floods.FLOODS:
@@ -110,16 +109,6 @@ def _daemon(session: Path) -> Generator[tuple[int, int]]:
             if process.stdout is None or process.stdout.readline() != b"ready\n":
                 raise ValueError("the daemon of the bench has not begun")
             yield ports
-        finally:
-            process.kill()
-
-
-@contextmanager
-def _followed(session: Path) -> Generator[None]:
-    (daemon,) = [each for each in living() if each.entry.session == str(session)]
-    with subprocess.Popen([sys.executable, "-c", FOLLOW, str(daemon.socket), str(VIEWERS)]) as process:
-        try:
-            yield
         finally:
             process.kill()
 

@@ -18,11 +18,9 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from tests.bench import abort, jitter
-from tests.bench.figures import Figure, progress, skipped
+from tests.bench.figures import Figure, progress, require_aravis
 from tests.bench.waiting import waiting
 from tests.system.simulated_orders import simulated_order
-from thermostand.drivers.framing.aravis_library import library
-from thermostand.foundation.errors import StandError
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.opening.stop import Interrupted, Stop
@@ -124,10 +122,7 @@ def followed(session: Path) -> Generator[None]:
 
 def _frames(directory: Path) -> list[Figure]:
     what = f"frame schedule at {1 / jitter.INTERVAL_s:g} fps, {VIEWERS} viewers, deviation"
-    try:
-        library()
-    except StandError as error:
-        return [skipped(what, error)]
+    require_aravis()
     progress(f"{jitter.FRAMES} frames in real time with {VIEWERS} viewers")
     order = simulated_order(directory, jitter.RECIPE, poll_s=1.0)
     out, viewers = directory / "viewed", list[subprocess.Popen[bytes]]()

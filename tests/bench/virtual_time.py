@@ -13,11 +13,9 @@ import shutil
 import time
 from pathlib import Path
 
-from tests.bench.figures import Figure, absolute, in_turns, progress, side_by_side, skipped
+from tests.bench.figures import Figure, absolute, in_turns, progress, require_aravis, side_by_side
 from tests.system.simulated_orders import simulated_order
-from thermostand.drivers.framing.aravis_library import library
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
-from thermostand.foundation.errors import StandError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
 from thermostand.stand.run import one_cpu, run_virtual
@@ -37,10 +35,7 @@ experiments:
 def figures(directory: Path) -> list[Figure]:
     """Simulated seconds per second, and bare control-socket round trips per second."""
     what = "virtual time, whole stand polled"
-    try:
-        library()
-    except StandError as error:
-        return [skipped(what, error)]
+    require_aravis()
     order = simulated_order(directory, RECIPE)
     sessions = (directory / f"run-{number}" for number in itertools.count())
     trips_per_s: list[float] = []

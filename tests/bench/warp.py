@@ -6,8 +6,6 @@ core, without what other programs take of it; reading and writing the pixels onc
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, at_most, in_turns, progress, side_by_side
+from tests.bench.figures import Figure, at_most, in_turns, processor_ms, progress, side_by_side
 from tests.compensation.rendered import Scene, render
 from thermostand.compensation.apply.compensate_images import warp
 from thermostand.compensation.drift_runtime import source_offset
@@ -41,8 +39,8 @@ def figures(directory: Path) -> list[Figure]:
     at = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
     at = (at + source_offset(_drift, at)).astype(np.float32).reshape(height, width, 2)
     own, other = in_turns(
-        lambda: _processor_ms(lambda: warp(image, _drift)),
-        lambda: _processor_ms(lambda: cv2.remap(image, at, NOT_SPLIT, cv2.INTER_LANCZOS4)),
+        lambda: processor_ms(lambda: warp(image, _drift)),
+        lambda: processor_ms(lambda: cv2.remap(image, at, NOT_SPLIT, cv2.INTER_LANCZOS4)),
         ROUNDS,
     )
     target = load_target(packaged("targets", "paper-9x6"))
@@ -59,12 +57,6 @@ def figures(directory: Path) -> list[Figure]:
         at_most(25, side_by_side("warp, 5 MP frame", "ms/frame", PEER, own, other)),
         at_most(0.5, side_by_side("warp, error of the markers", "mpx RMS", PEER, errors[:1], errors[1:])),
     ]
-
-
-def _processor_ms(work: Callable[[], object]) -> float:
-    begin_s = time.thread_time()
-    work()
-    return 1e3 * (time.thread_time() - begin_s)
 
 
 def _drift(xy_px: Float) -> Float:
