@@ -16,7 +16,6 @@ import struct
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
 from threading import Event, Lock
@@ -154,22 +153,11 @@ def _seen(future: asyncio.Future[Any]) -> None:
         future.exception()
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
-    """`function(*args)`, or the method of that name of what is kept under `target`. keep: the name for the result."""
-
-    function: Callable[..., object] | str
-    args: tuple[object, ...] = ()
-    target: str = ""
-    keep: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What the request returned, or raised."""
-
-    result: object = None
-    error: BaseException | None = None
+_Request = tuple[Callable[..., object] | str, tuple[object, ...], str, str]
+"""A function and its arguments, "", and the name under which its result is kept, "" for none; or the name of a method,
+its arguments, and what is kept under which name has that method."""
+_Answer = tuple[object, BaseException | None]
+"""What the request returned, or raised."""
 
 
 def send(connection: socket.socket, data: bytes) -> None:
@@ -204,29 +192,29 @@ def answered(data: bytes | bytearray, kept: dict[str, object]) -> bytes:
     try:
         return _pickled(_answer(pickle.loads(data), kept))
     except Exception as error:  # noqa: BLE001 - as above
-        return _pickled(Answer(error=OSError(errno.EPROTO, _garbled(error))))
+        return _pickled((None, OSError(errno.EPROTO, _garbled(error))))
 
 
 def _garbled(error: Exception) -> str:
     return f"a call to another process failed ({type(error).__name__}: {error}); was the program replaced meanwhile?"
 
 
-def _pickled(message: Request | Answer) -> bytes:
+def _pickled(message: _Request | _Answer) -> bytes:
     return pickle.dumps(message, protocol=5)
 
 
-def _answer(request: Request, kept: dict[str, object]) -> Answer:
+def _answer(request: _Request, kept: dict[str, object]) -> _Answer:
     """What comes of the request."""
+    function, args, target, keep = request
     try:
-        if isinstance(request.function, str):
-            return Answer(getattr(kept[request.target], request.function)(*request.args))
-        result = request.function(*request.args)
-        if request.keep:
-            kept[request.keep] = result
-            return Answer()
-        return Answer(result)
+        if isinstance(function, str):
+            return getattr(kept[target], function)(*args), None
+        result = function(*args)
+        if keep:
+            kept[keep], result = result, None
+        return result, None
     except BaseException as error:  # noqa: BLE001 - the daemon waits for any error
-        return Answer(error=error)
+        return None, error
 
 
 def answer_all(connection: socket.socket, kept: dict[str, object]) -> None:
@@ -250,15 +238,15 @@ class Line:
 
     def run(self, function: Callable[..., object], *args: object) -> Any:
         """`function(*args)` there; both are pickled. Raises what it raises, and OSError when the process is gone."""
-        return self._asked(Request(function, args))
+        return self._asked((function, args, "", ""))
 
     def make(self, name: str, function: Callable[..., object], *args: object) -> None:
         """Keep what `function(*args)` returns there under this name, which every line then knows."""
-        self._asked(Request(function, args, keep=name))
+        self._asked((function, args, "", name))
 
     def call(self, name: str, method: str, *args: object) -> Any:
         """The method of what is kept under this name."""
-        return self._asked(Request(method, args, name))
+        return self._asked((method, args, name, ""))
 
     def close(self) -> None:
         """No more requests; the one under way is completed."""
@@ -266,7 +254,7 @@ class Line:
             self._connection.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for an answer
         self._connection.close()
 
-    def _asked(self, request: Request) -> Any:
+    def _asked(self, request: _Request) -> Any:
         data = _pickled(request)
         with self._lock:
             try:
@@ -277,9 +265,10 @@ class Line:
         if answer is None:
             raise OSError(errno.EPIPE, self._ended)
         try:
-            found: Answer = pickle.loads(answer)
+            found: _Answer = pickle.loads(answer)
+            result, raised = found
         except Exception as error:
             raise OSError(errno.EPROTO, _garbled(error)) from error
-        if found.error is not None:
-            raise found.error
-        return found.result
+        if raised is not None:
+            raise raised
+        return result

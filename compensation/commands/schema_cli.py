@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from thermostand.compensation.budget.geometry import Geometry
 from thermostand.compensation.datasheet.details import Details
 from thermostand.foundation.command_app import App
+from thermostand.foundation.documents import write_schemas
 from thermostand.foundation.output import show
-from thermostand.foundation.schemas import write_schemas
 
 DOCUMENTS: Mapping[str, type[BaseModel]] = {"geometry": Geometry, "details": Details}
 

@@ -14,53 +14,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import thermostand.drivers.sim
-from thermostand.drivers.sim.physics.plant import Plant
-from thermostand.drivers.sim.units.modbus import Unit
-from thermostand.drivers.sim.wire import Engine
-from thermostand.foundation.clock import Now
+
+if TYPE_CHECKING:
+    from thermostand.drivers.sim.laboratory import Laboratory as Bench
+else:
+    Bench = object  # the laboratory that is being built, which knows its fakes
 
 GROUP = "thermostand.fakes"
-
-
-class Bench(Protocol):
-    """The laboratory that is being built. fakes: those that are there, by the name of their device."""
-
-    fakes: dict[str, object]
-
-    @property
-    def plant(self) -> Plant:
-        """The physics."""
-        ...
-
-    @property
-    def clock(self) -> Now:
-        """Its time."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """Of all that is random."""
-        ...
-
-    @property
-    def has_relays(self) -> bool:
-        """Whether a relay board feeds and permits; without one what would be switched is on."""
-        ...
-
-    def on_bus(self, unit: Unit) -> None:
-        """It answers on the Modbus line."""
-        ...
-
-    def listen(self, name: str, address: str, make_engine: Callable[[], Engine]) -> None:
-        """A wire of its own at that address, with a new engine for each conversation."""
-        ...
-
-    def found_at(self, name: str, address: str, close: Callable[[], None]) -> None:
-        """It answers there, by means of its own."""
-        ...
 
 
 Build = Callable[[Bench, str, Mapping[str, Any]], object]

@@ -20,7 +20,7 @@ import tty
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 # How to break a link: byte-level faults between a fake's protocol engine and its descriptor.
 
@@ -287,7 +287,7 @@ class TcpWire:
 _MIXED = ("drop", "flip", "cut", "junk", "late")
 
 # Kind -> worst value, the one that mends it, meaning.
-LINK_FAULTS: dict[str, tuple[object, object, str]] = {
+LINK_FAULTS: dict[str, tuple[float, float, str]] = {
     "silent": (True, False, "no reply leaves"),
     "drop": (0.05, 0.0, "share of replies lost"),
     "flip": (0.05, 0.0, "share of replies with one bit flipped"),
@@ -315,7 +315,7 @@ class FaultyLink:
     faults: LinkFaults
 
 
-def set_link_fault(link: FaultyLink, kind: str, value: object) -> None:
+def set_link_fault(link: FaultyLink, kind: str, value: Any) -> None:
     """One of LINK_FAULTS; must not be called under a lock that the wire's thread may want."""
     match kind:
         case "unplugged":
@@ -326,9 +326,6 @@ def set_link_fault(link: FaultyLink, kind: str, value: object) -> None:
         case "mixed":
             for each in _MIXED:
                 setattr(link.faults, each, float(str(value or 0)) / len(_MIXED))
-        case "silent" | "echo" | "byte_by_byte" | "flow_control" | "hangs_up" | "swallows_first":
-            setattr(link.faults, kind, bool(value))
-        case "garbled":
-            link.faults.garbled = int(str(value or 0))
         case _:
-            setattr(link.faults, kind, float(str(value or 0)))
+            _, mended, _ = LINK_FAULTS[kind]
+            setattr(link.faults, kind, type(mended)(value or 0))

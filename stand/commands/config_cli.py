@@ -12,8 +12,8 @@ from pydantic import BaseModel
 from thermostand.drivers.camera_preset import CameraPreset
 from thermostand.drivers.wires.registers import RegisterMap
 from thermostand.foundation.command_app import App
+from thermostand.foundation.documents import write_schemas
 from thermostand.foundation.output import show
-from thermostand.foundation.schemas import write_schemas
 from thermostand.markers.target import Target
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, packaged

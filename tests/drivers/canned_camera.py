@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import struct
-from contextlib import suppress
 
 from tests.drivers.canned_line import Feed, Parser
-from tests.sim.gvcp_client import decode_ack, decode_leader
-from thermostand.drivers.sim.gige import gvcp, gvsp
+from tests.sim.gvcp_client import decode_ack
+from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Registers
 from thermostand.drivers.sim.gige.genicam import features
 
@@ -24,13 +23,6 @@ _GVCP = tuple(
         "42 00 0040 000c 0005 0000 0007 00000003 00000009",
         "42 10 0040 0014 0006 0000 0000 00000003 00000009 0000000100000000",
     )
-)
-_GVSP = (
-    bytes.fromhex(
-        "0000 0001 01000000 0000 0001 0102030405060708 01080001 00000040 00000030 00000004 00000002 0000 0000"
-    ),
-    bytes.fromhex("0000 ffff 03000005 aabb"),
-    bytes.fromhex("0000 0000 83000000 0000000100000002 01020304 cc"),
 )
 
 
@@ -69,20 +61,3 @@ def gvcp_commands() -> Parser:
         return feed
 
     return Parser(_GVCP, make)
-
-
-def gvsp_packets() -> Parser:
-    def feed(number: int, wire: bytes) -> bool:
-        try:
-            packet = gvsp.decode(wire)
-        except gvsp.Malformed:
-            return False
-        assert wire.endswith(packet.data)
-        assert gvsp.decode(packet.encode()) == packet
-        with suppress(gvsp.Malformed):
-            leader = decode_leader(packet.data)
-            assert decode_leader(leader.encode()) == leader
-            assert leader.encode()[4:32] == packet.data[4:32]
-        return True
-
-    return Parser(_GVSP, lambda: feed)

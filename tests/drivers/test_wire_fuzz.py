@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.drivers.canned_camera import gvcp_commands, gvsp_packets
+from tests.drivers.canned_camera import gvcp_commands
 from tests.drivers.canned_chambers import ascii2, cts, cts_state, espec, espec_monitor, julabo, simserv, texts
 from tests.drivers.canned_devices import jrk, modbus, ximc
 from tests.drivers.canned_imager import radiometric
@@ -29,7 +29,6 @@ PARSERS: dict[str, Parser] = {
     "Vaisala": texts("vaisala"),
     "Jrk variables": jrk(),
     "GVCP": gvcp_commands(),
-    "GVSP": gvsp_packets(),
     "FFF": radiometric(),
 }
 

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.addresses import camera_address
-from tests.sim.gvcp_client import decode_ack, decode_leader, pack_read_memory
+from tests.sim.gvcp_client import Packet, decode_ack, decode_leader, decode_packet, pack_read_memory
 from tests.still_plant import StillPlant
-from thermostand.drivers.sim.gige import gvcp, gvsp
+from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.genicam import features
 from thermostand.drivers.sim.gige.gvcp import Ack, GvcpCommand, GvcpRequest, GvcpStatus, Resend
-from thermostand.drivers.sim.gige.gvsp import Packet, PacketKind
+from thermostand.drivers.sim.gige.gvsp import PacketKind
 from thermostand.foundation.clock import seconds_ns
 
 WIDTH, HEIGHT = 320, 240
@@ -98,7 +98,7 @@ class Client:
 
     def packet(self, wait_s: float = WAIT_s) -> Packet:
         self.stream.settimeout(wait_s)
-        return gvsp.decode(self.stream.recv(65536))
+        return decode_packet(self.stream.recv(65536))
 
     def packets(self) -> list[Packet]:
         """All packets up to a trailer."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from thermostand.drivers.sim.gige import gvsp
-from thermostand.drivers.sim.gige.gvcp import Ack, Malformed
+from thermostand.drivers.sim.gige.gvcp import Ack
+from thermostand.drivers.sim.gige.gvsp import PacketKind
 
 _ACK = struct.Struct(">HHHH")
 _LEADER = struct.Struct(">HHQIIIIIHH")
@@ -14,16 +16,10 @@ _IMAGE = 1
 
 
 def decode_ack(datagram: bytes) -> Ack:
-    """The acknowledge in a datagram; bytes behind its stated length are ignored. Malformed when it is none."""
-    if len(datagram) < _ACK.size:
-        raise Malformed(f"{len(datagram)} bytes are no GVCP header")
+    """The acknowledge in a datagram."""
     status, code, length, req_id = _ACK.unpack_from(datagram)
-    if code == 0:
-        raise Malformed("an acknowledge of no command")
-    body = datagram[_ACK.size : _ACK.size + length]
-    if len(body) < length:
-        raise Malformed(f"{len(body)} of {length} payload bytes")
-    return Ack(code - 1, req_id, body, status)
+    assert len(datagram) == _ACK.size + length
+    return Ack(code - 1, req_id, datagram[_ACK.size :], status)
 
 
 def pack_words(words: Iterable[int]) -> bytes:
@@ -37,11 +33,30 @@ def pack_read_memory(address: int, count: int) -> bytes:
     return struct.pack(">IHH", address, 0, count)
 
 
+@dataclass(frozen=True)
+class Packet:
+    """One stream packet as received; `data` is what follows the header."""
+
+    kind: PacketKind
+    block_id: int
+    packet_id: int
+    data: bytes
+    status: int
+    extended: bool = False
+
+
+def decode_packet(datagram: bytes) -> Packet:
+    """The packet in a datagram, whose header has 8 bytes or 20; ValueError when it is of an unknown kind."""
+    status, block_id, word = struct.unpack_from(">HHI", datagram)
+    is_extended, packet_id = bool(word >> 31), word & 0xFFFFFF
+    if is_extended:
+        block_id, packet_id = struct.unpack_from(">QI", datagram, 8)
+    data = datagram[gvsp.header_size(is_extended) :]
+    return Packet(PacketKind(word >> 24 & 0x7F), block_id, packet_id, data, status, is_extended)
+
+
 def decode_leader(data: bytes) -> gvsp.Leader:
-    """The leader in the data of a leader packet; gvsp.Malformed when short or no image."""
-    if len(data) < _LEADER.size:
-        raise gvsp.Malformed(f"leader of {len(data)} bytes")
+    """The leader in the data of a leader packet of an image."""
     _, payload_type, timestamp, pixel_format, width, height, offset_x, offset_y, _, _ = _LEADER.unpack_from(data)
-    if payload_type != _IMAGE:
-        raise gvsp.Malformed(f"payload of type {payload_type:#x}")
+    assert payload_type == _IMAGE
     return gvsp.Leader(timestamp, pixel_format, width, height, offset_x, offset_y)

@@ -19,12 +19,12 @@ from tests.sim.camera_client import (
     image_of,
     render,
 )
-from tests.sim.gvcp_client import decode_leader, pack_words
+from tests.sim.gvcp_client import Packet, decode_leader, pack_words
 from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige import gvsp
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvcp import GvcpCommand, GvcpStatus, Resend
-from thermostand.drivers.sim.gige.gvsp import Packet, PacketKind
+from thermostand.drivers.sim.gige.gvsp import PacketKind
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamSender
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app as compensate
 from thermostand.compensation.commands.schema_cli import DOCUMENTS as OFFLINE
-from thermostand.foundation.schemas import schema_text
+from thermostand.foundation.documents import schema_text
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.commands.config_cli import DOCUMENTS
 

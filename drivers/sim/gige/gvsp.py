@@ -1,4 +1,4 @@
-"""GVSP, the stream protocol of GigE Vision, as bytes: both roles, no I/O.
+"""GVSP, the stream protocol of GigE Vision, as a camera speaks it: bytes, no I/O.
 
 One image is one block: packet 0 is the leader, 1..n carry the pixels, n + 1 is the trailer. Everything is big endian
 but the pixels. The header has 8 bytes with 16-bit block ids, or 20 with 64-bit ones ("extended"); GigE Vision 2.0,
@@ -58,26 +58,6 @@ class PixelFormat(IntEnum):
         return -(-pixels * (self >> 16 & 0xFF) // 8)
 
 
-class Malformed(ValueError):
-    """These bytes are no GVSP packet."""
-
-
-@dataclass(frozen=True)
-class Packet:
-    """One packet as received; `data` is what follows the header."""
-
-    kind: PacketKind
-    block_id: int
-    packet_id: int
-    data: bytes = b""
-    status: int = OK
-    extended: bool = False
-
-    def encode(self) -> bytes:
-        """The datagram."""
-        return header(self.kind, self.block_id, self.packet_id, self.status, self.extended) + self.data
-
-
 def header_size(extended: bool) -> int:
     """Bytes of a GVSP header."""
     return _EXTENDED.size if extended else _SHORT.size
@@ -88,23 +68,6 @@ def header(kind: PacketKind, block_id: int, packet_id: int, status: int, extende
     if extended:
         return _EXTENDED.pack(status, 0, (_EXTENDED_BIT | kind) << 24, block_id, packet_id)
     return _SHORT.pack(status, block_id, kind << 24 | packet_id)
-
-
-def decode(datagram: bytes) -> Packet:
-    """The packet in a datagram; Malformed when it is too short or of an unknown kind."""
-    if len(datagram) < _SHORT.size:
-        raise Malformed(f"{len(datagram)} bytes are no GVSP header")
-    status, block_id, word = _SHORT.unpack_from(datagram)
-    extended = bool(word >> 24 & _EXTENDED_BIT)
-    packet_id = word & 0xFFFFFF
-    if extended:
-        if len(datagram) < _EXTENDED.size:
-            raise Malformed(f"{len(datagram)} bytes are no extended GVSP header")
-        status, _, word, block_id, packet_id = _EXTENDED.unpack_from(datagram)
-    kind = word >> 24 & ~_EXTENDED_BIT
-    if kind not in (PacketKind.LEADER, PacketKind.TRAILER, PacketKind.PAYLOAD):
-        raise Malformed(f"packet of kind {kind}")
-    return Packet(PacketKind(kind), block_id, packet_id, datagram[header_size(extended) :], status, extended)
 
 
 @dataclass(frozen=True)
