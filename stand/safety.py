@@ -19,7 +19,7 @@ from thermostand.foundation.tasks import first_of
 
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
 _PAUSE_S = 1.0  # between tries
-_REPORTED_EVERY_S = 60.0
+_REPORTED_AFTER_S = 60.0
 _GIVEN_UP_AFTER_S = 60.0  # before that, a second signal does not end it
 
 
@@ -210,11 +210,12 @@ class Safety:
 
     async def confirmed(self, limit_s: float) -> bool:
         """Whether everything is confirmed within that time, on the stand's clock, and before an operator gives up; an
-        event each minute says what is not."""
-        end_ns = self._clock.now_ns() + seconds_ns(limit_s)
+        event says what is not, after a minute and then each time in twice as long."""
+        end_ns, wait_s = self._clock.now_ns() + seconds_ns(limit_s), _REPORTED_AFTER_S
         await self.tried()
         while not self.is_confirmed and not self._given_up and self._clock.now_ns() < end_ns:
-            due_ns = min(end_ns, self._clock.now_ns() + seconds_ns(_REPORTED_EVERY_S))
+            due_ns = min(end_ns, self._clock.now_ns() + seconds_ns(wait_s))
+            wait_s *= 2.0
             if not await self._changes_before(due_ns) and not self.is_confirmed:
                 text, unconfirmed = f"still trying: {'; '.join(self.unconfirmed)}", list(self.unconfirmed)
                 self._hub.publish(NOT_CONFIRMED_SAFE.at(self._clock.now_ns(), text, unconfirmed=unconfirmed))

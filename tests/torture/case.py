@@ -157,11 +157,14 @@ UNDONE = {
 """What follows on an order, some time later."""
 
 
+CYCLES = 0.15  # of the seeds, as far as their stand has one camera
+
+
 def draw(seed: int) -> Case:
     """The case of a seed."""
     drawn = random.Random(seed)
     stand = draw_stand(drawn)
-    plan, duration_s = _plan(drawn, stand)
+    plan, duration_s = _cycle(random.Random(f"cycle {seed}"), stand) or _plan(drawn, stand)
     left = {kind for kind in (*KINDS, *ORDERS, "kill") if drawn.random() >= LEFT_OUT}
     return Case(
         seed,
@@ -191,6 +194,16 @@ def draw_stand(drawn: random.Random) -> dict[str, str]:
     names = {place: [each.name for each in choices] for place, choices in PLACES.items()}
     names["heat"] = [name for name in names["heat"] if name not in NOT_SIMULATED]
     return {place: drawn.choice((PLAIN[place], drawn.choice(names[place]))) for place in PLACES}
+
+
+def _cycle(drawn: random.Random, stand: dict[str, str]) -> tuple[dict[str, list[Any]], float] | None:
+    """For some seeds the paper's cycle, to which the drift can be fitted, and about how long it takes, s."""
+    if drawn.random() > CYCLES or stand["cameras"] != "1 camera":
+        return None
+    points, soak_s = drawn.sample(range(26, 46, 3), drawn.randint(3, 5)), drawn.choice((600, 1500))
+    cycle = {"set_points_degC": points, "dwell_s": soak_s, "equilibrium_s": soak_s, "reference_frames": 3}
+    cycle["frames_per_point"] = drawn.choice((1, 2))
+    return {"experiments": [{"thermal_cycle": cycle}]}, 900.0 + (len(points) + 1) * (soak_s + 180.0)
 
 
 def _plan(drawn: random.Random, stand: dict[str, str]) -> tuple[dict[str, list[Any]], float]:

@@ -27,6 +27,7 @@ from tests.torture.real import KINDS as REAL
 from thermostand.foundation.clock import seconds_ns
 
 ROW = np.dtype([("time_ns", "<i8"), *((name, "<f8") for name in TRUTH)])
+CENTRES = np.dtype([("time_ns", "<i8"), ("xy_px", "<f8", (54, 2))])
 
 STEP_S = 0.5  # of the plant: what is switched or broken within a step acts from its begin on
 LATE_S = 3.0  # what is done in real time is done so much later at worst, on a busy machine
@@ -118,6 +119,13 @@ class Evidence:
         paths = [self.folder / f"truth-{number}.bin" for number in range(len(self.lives))]
         found = [path.read_bytes() if path.exists() else b"" for path in paths]
         return [np.frombuffer(data[: len(data) // ROW.itemsize * ROW.itemsize], ROW) for data in found]
+
+    @cached_property
+    def centres(self) -> dict[int, np.ndarray]:
+        """Where the target's centres (54, 2) truly were in the image of an instant, px."""
+        data = b"".join(path.read_bytes() for path in sorted(self.folder.glob("centres-*.bin")))
+        rows = np.frombuffer(data[: len(data) // CENTRES.itemsize * CENTRES.itemsize], CENTRES)
+        return dict(zip(rows["time_ns"].tolist(), rows["xy_px"], strict=True))
 
     def true_at(self, time_ns: int) -> np.void | None:
         """The plant at an instant: that of the last life begun by then, as each has a laboratory of its own."""

@@ -1,8 +1,8 @@
 """The simulated laboratory of a torture run: `python -m tests.torture.laboratory`, in the place of `drivers.sim`.
 
 It breaks what the case says, in the case's own time, and writes down what truly happened in the program's N-th life:
-the plant at each of its steps (truth-N.bin) and the bytes on each wire (wire-N.jsonl). When the program is gone, time
-goes on for AFTER_S: what is on then shows.
+the plant at each of its steps (truth-N.bin), the true centres in each image (centres-N.bin) and the bytes on each wire
+(wire-N.jsonl). When the program is gone, time goes on for AFTER_S: what is on then shows.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from tests.torture.case import Case, Fault, read_case
 from thermostand.drivers.sim.control import serve_control
 from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
 from thermostand.drivers.sim.laboratory_faults import FaultSchedule, PlannedFault
+from thermostand.drivers.sim.physics.optics import Optics, true_centres_px
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.ending import Ending
@@ -35,7 +36,7 @@ TRUTH = (
 )
 _NAMED = {"axis": "linear|rotary", "chamber": "chamber|regulator", "inputs": "inputs|door", "heater": "heat"}
 """What the program calls a device that has another name here."""
-ROW = struct.Struct(f"<q{len(TRUTH)}d")
+ROW, CENTRES = struct.Struct(f"<q{len(TRUTH)}d"), struct.Struct("<q108d")
 
 
 class ObservedLaboratory(Laboratory):
@@ -46,6 +47,9 @@ class ObservedLaboratory(Laboratory):
         self._wires = (folder / f"wire-{life}.jsonl").open("w", buffering=1)
         super().__init__(spec)
         self.plant.on_step.append(self._note)  # after the regulator's and the relays'
+        self._centres = (folder / f"centres-{life}.bin").open("wb")
+        seen_by = self.plant.optics
+        self.plant.optics = lambda time_ns, *kind: self._noted(time_ns, seen_by(time_ns, *kind))
 
     def after(self) -> None:
         """Time goes on without the program."""
@@ -55,12 +59,18 @@ class ObservedLaboratory(Laboratory):
     def close(self) -> None:
         super().close()
         self._truth.close()
+        self._centres.close()
         self._wires.close()
 
     def _note(self, time_ns: int, dt_s: float) -> None:
         plant = self.plant
         values = [plant.flap_open_at(time_ns) if name == "flap_open" else float(getattr(plant, name)) for name in TRUTH]
         self._truth.write(ROW.pack(time_ns, *values))
+
+    def _noted(self, time_ns: int, optics: Optics) -> Optics:
+        """What a camera sees, with where the target's centres truly are in its image."""
+        self._centres.write(CENTRES.pack(time_ns, *true_centres_px(optics).flat))
+        return optics
 
     def listen(self, name, address, make_engine) -> None:
         super().listen(name, address, make_engine)

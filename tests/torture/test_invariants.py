@@ -23,14 +23,25 @@ from tests.torture.lives import live
 from tests.torture.real import draw_real
 from tests.torture.rig import shrunk
 
+
+def at(degC: float, role: str) -> list[Any]:
+    return [
+        {"set_temperature": degC},
+        {"soak": 600},
+        "open_flap",
+        {"capture": {"frames": 2, "interval_s": 5, "role": role}},
+        "close_flap",
+    ]
+
+
 QUIET = {
     "steps": [
         "close_flap",
         {"start_chamber": 26},
-        {"soak": 300},
-        "open_flap",
-        {"capture": {"frames": 2, "interval_s": 5, "role": "fit"}},
-        "close_flap",
+        *at(26, "reference"),
+        *at(30, "fit"),
+        *at(34, "fit"),
+        *at(38, "fit"),
         {"set_temperature": 16},
         {"soak": 300},
         "stop_chamber",
@@ -110,6 +121,12 @@ def misread(evidence: Evidence) -> None:
     evidence.temperatures["air"] = [(at, degC + 2.0, quality) for at, degC, quality in evidence.temperatures["air"]]
 
 
+def blow_up(evidence: Evidence) -> None:
+    """What the camera truly saw, the more the later."""
+    for share, centres in enumerate(evidence.centres.values()):
+        centres *= 1.0 + 0.001 * share
+
+
 FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "air_is_never_too_warm": lambda evidence: changed(evidence, "bulk_air_degC", 69.0, 0.5, 0.6),
     "heat_needs_a_permission_of_the_last_15_s": lambda evidence: no_more(evidence, lambda unit: unit == RELAYS_UNIT),
@@ -131,6 +148,7 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "is_completed_in_the_end": lambda evidence: end(evidence, status=1),
     "is_told_what_to_mend": fail_thrice,
     "nobody_is_pestered": pester,
+    "a_fit_holds_the_truth": blow_up,
     "heat_ends_with_the_program": stop_program,
     "a_stop_is_answered": press_stop,
     "nothing_is_left": lambda evidence: end(evidence, left=("python -m thermostand.foundation.helper",)),
@@ -140,7 +158,7 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
 
 def test_a_quiet_case_breaks_no_invariant(quiet: Evidence):
     assert quiet.is_complete
-    assert sum(quiet.frames.values()) == 2
+    assert sum(quiet.frames.values()) == 8
     assert violations(quiet) == []
 
 
@@ -148,6 +166,7 @@ def test_a_quiet_case_breaks_no_invariant(quiet: Evidence):
 def test_an_invariant_finds_what_it_forbids(quiet: Evidence, name: str):
     evidence = copy.deepcopy(quiet)
     evidence.__dict__["truth"] = [truth.copy() for truth in quiet.truth]
+    evidence.__dict__["centres"] = {time_ns: centres.copy() for time_ns, centres in quiet.centres.items()}
     FORBIDDEN[name](evidence)
     assert list(INVARIANTS[name](evidence))
 
