@@ -20,10 +20,14 @@ from thermostand.foundation.hub import Hub
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
 from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.fault import Fault
+from thermostand.stand.fault import Fault, Watch
 from thermostand.stand.guarding.channels import ChannelCheck
 from thermostand.stand.guarding.guard import Guard
-from thermostand.stand.guarding.interlocks import Recording, Watch, heat_uncontrolled, intrusion
+from thermostand.stand.guarding.interlocks import (
+    Recording,
+    heat_uncontrolled,
+    intrusion,
+)
 from thermostand.stand.guarding.met_errors import MetErrors
 from thermostand.stand.guarding.notify import Notifier
 from thermostand.stand.guarding.rules import Announcements, camera_measured, natures, recorded, vital, watches
@@ -134,7 +138,7 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     stand = Stand(devices, chamber, supply, hub, clock)
     if isinstance(regulator := devices.regulator, SoftwareRegulator):
         regulator.permitted = lambda: stand.chamber.permits.gives
-    check = ChannelCheck(natures(config), config.guard.sensors, config.guard.frozen, hub.publish)
+    check = ChannelCheck(natures(config), config.guard.sensors, hub.publish)
     stand.imaging.doubt_of = check.doubt_of
     return Assembly(config, hub, clock, bus, devices, stand, equipment, notifier, check)
 

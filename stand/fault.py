@@ -1,13 +1,15 @@
-"""What the guard objects to, and what a rule may look at."""
+"""What a rule of the guard is: what it may look at, what it objects to, and how long it must to be believed."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 from pydantic import JsonValue
 
+from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.events import guard_kind
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Reading
@@ -59,6 +61,40 @@ class Fault:
     def at(self, time_ns: int) -> Event:
         """That the rule objects, as an event."""
         return guard_kind(self.rule).at(time_ns, self.text, rule=self.rule, **self.data)
+
+
+Rule = Callable[[Readings, int], Fault | None]
+
+
+@dataclass(slots=True)
+class Watch:
+    """A rule, how long it must object without a break before it counts (s), and what is then done.
+
+    objection: the rule's at the last check, within its grace time, too. after_gap_s: for so long after a look that came
+    late its objection does not count, because it judges by how old something is that could not be renewed meanwhile.
+    Permits wait for fresh readings all that time.
+    """
+
+    rule: Rule
+    grace_s: float = 0.0
+    action: Action = "abort"
+    since_ns: int | None = None
+    objection: Fault | None = None
+    ends_itself: bool = False
+    after_gap_s: float = 0.0
+
+    def check(self, readings: Readings, now_ns: int) -> Fault | None:
+        """The rule's fault once it has stood for the grace time."""
+        fault = self.objection = self.rule(readings, now_ns)
+        if fault is None:
+            self.since_ns = None
+            return None
+        if self.since_ns is None:
+            self.since_ns = now_ns
+        if now_ns - self.since_ns < seconds_ns(self.grace_s):
+            return None
+        lasting = f", for {self.grace_s:g} s" if self.grace_s > 0 else ""
+        return replace(fault, text=fault.text + lasting, action=self.action, ends_itself=self.ends_itself)
 
 
 def value_of(readings: Readings, channel: str) -> float:

@@ -4,70 +4,47 @@ from __future__ import annotations
 
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializeAsAny, field_validator, model_validator
 
 from thermostand.foundation.documents import Document
+from thermostand.stand.config.added_rules import added_rules
 from thermostand.stand.config.chamber_section import (
-    CameraFeelsConfig,
-    FirstHeatConfig,
-    FrozenConfig,
-    GraniteFeelsConfig,
-    HeatFeltConfig,
-    NeededOutputConfig,
+    CameraCrosscheckConfig,
+    GraniteCrosscheckConfig,
+    HeatBalanceConfig,
+    StartupResponseConfig,
+    SteadyStatePowerConfig,
 )
 
 
-class HeatingConfig(Document):
-    """Heater on, but not warming. While the regulator's output is above output_percent, its relay is on and the
-    temperature is more than hysteresis_K below the set-point, it must rise by gain_K every window_s. When it does not,
-    what it lacks is summed up, and more than max_error_K_s is a fault. gain_K in window_s should be about half of your
-    chamber's slowest rate at such an output: the simulated one never takes longer than 170 s for 2 K.
-    """
-
-    output_percent: float = Field(default=50.0, gt=0, le=100)
-    hysteresis_K: float = Field(default=1.0, gt=0, le=10)
-    gain_K: float = Field(default=2.0, gt=0, le=10)
-    window_s: float = Field(default=600.0, gt=0, le=3600)
-    max_error_K_s: float = Field(default=600.0, gt=0, le=36000)
-
-
 class HeaterOffConfig(Document):
-    """Warming with the heater off. settle_s after the heat was switched off the air may rise by rise_K, or end less
-    than above_surroundings_K above laboratory and granite."""
+    """Warming with the heater off. Two minutes after the heat was switched off the air may rise by rise_K, or end less
+    than 5 K above laboratory and granite."""
 
-    settle_s: float = Field(default=120.0, ge=0, le=3600)
     rise_K: float = Field(default=2.0, gt=0, le=20)
-    above_surroundings_K: float = Field(default=5.0, ge=0, le=20)
 
 
 class CoolingConfig(Document):
-    """Cooling in vain. While the compressor runs, the heater's output is 0 and the air is more than margin_K above
+    """Cooling in vain. While the compressor runs, the heater's output is 0 and the air is more than 2 K above
     laboratory and granite, it must fall by fall_K every window_s: a welded relay could balance the cold."""
 
     window_s: float = Field(default=600.0, gt=0, le=3600)
     fall_K: float = Field(default=0.5, gt=0, le=10)
-    margin_K: float = Field(default=2.0, ge=0, le=20)
 
 
 class SensorsConfig(Document):
-    """Thermometers against each other, and values that do not change. A difference of the air's from the regulator's
-    probe, or from a safety thermometer, above warn_K for warn_after_s is a warning; one of air and probe above trip_K
-    for trip_after_s is a fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A thermometer in fine steps
-    that is exactly constant for stuck_after_s is in doubt; the regulator's value constant for pv_stuck_after_s while
-    the air moves by air_moves_K is a fault. A temperature that moves by more than jump_K beyond its trend and its step
-    within jump_within_s is in doubt: a contact, a cable, not a temperature. drift_K: a change of the difference of two
-    in the same air, at a set-point that is held again, is a warning.
+    """Thermometers against each other. A difference of the air's from the regulator's probe, or from a safety
+    thermometer, above warn_K for warn_after_s is a warning; one of air and probe above trip_K for trip_after_s is a
+    fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A temperature that moves by more than jump_K beyond
+    its trend and its step within a few polls is in doubt: a contact, a cable, not a temperature. drift_K: a change of
+    the difference of two in the same air, at a set-point that is held again, is a warning.
     """
 
     warn_K: float = Field(default=3.0, gt=0, le=20)
     warn_after_s: float = Field(default=600.0, ge=0, le=3600)
     trip_K: float = Field(default=6.0, gt=0, le=20)
     trip_after_s: float = Field(default=120.0, ge=0, le=3600)
-    stuck_after_s: float = Field(default=900.0, ge=60, le=36000)
-    pv_stuck_after_s: float = Field(default=60.0, ge=10, le=3600)
-    air_moves_K: float = Field(default=1.0, gt=0, le=20)
     jump_K: float = Field(default=2.0, gt=0, le=50)
-    jump_within_s: float = Field(default=15.0, gt=0, le=600)
     drift_K: float = Field(default=0.1, gt=0, le=5)
 
     @model_validator(mode="after")
@@ -86,7 +63,8 @@ class GuardConfig(Document):
     pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
     hours. notify: a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may
     take. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
-    safe_limit_s: how long, at the end of a run, it is tried to have every actuator confirm that it is safe.
+    added: settings of rules that other packages add, by their names. safe_limit_s: how long, at the end of a run, it is
+    tried to have every actuator confirm that it is safe.
     heat_max_Wh_per_h: within any hour; good nights took up to 900.
     """
 
@@ -97,17 +75,15 @@ class GuardConfig(Document):
     stale_after_s: float = Field(default=15.0, gt=0, le=120)
     heater_hold_s: float = Field(default=15.0, ge=2.0, le=60.0)
     heater_renew_s: float = Field(default=5.0, gt=0)
-    heating: HeatingConfig = HeatingConfig()
     heater_off: HeaterOffConfig = HeaterOffConfig()
     cooling: CoolingConfig = CoolingConfig()
     sensors: SensorsConfig = SensorsConfig()
     heat_max_Wh_per_h: float = Field(default=1400.0, gt=0, le=20_000)
-    heat_felt: HeatFeltConfig = HeatFeltConfig()
-    granite_feels: GraniteFeelsConfig = GraniteFeelsConfig()
-    camera_feels: CameraFeelsConfig = CameraFeelsConfig()
-    needed_output: NeededOutputConfig = NeededOutputConfig()
-    frozen: FrozenConfig = FrozenConfig()
-    first_heat: FirstHeatConfig = FirstHeatConfig()
+    heat_balance: HeatBalanceConfig = HeatBalanceConfig()
+    granite_crosscheck: GraniteCrosscheckConfig = GraniteCrosscheckConfig()
+    camera_crosscheck: CameraCrosscheckConfig = CameraCrosscheckConfig()
+    steady_state_power: SteadyStatePowerConfig = SteadyStatePowerConfig()
+    startup_response: StartupResponseConfig = StartupResponseConfig()
     keys_s: float = Field(default=30.0, ge=1, le=600)
     flap_open_s: float = Field(default=300.0, gt=0, le=36000)
     flap_capture_s: float = Field(default=2700.0, gt=0, le=36000)
@@ -117,7 +93,10 @@ class GuardConfig(Document):
     notify_limit_s: float = Field(default=10.0, gt=0, le=60)
     accept: tuple[str, ...] = ()
     pause_limit_h: float = Field(default=12.0, gt=0, le=24)
+    added: dict[str, SerializeAsAny[Document]] = Field(default_factory=dict)
     safe_limit_s: float = Field(default=600.0, ge=1, le=3600)
+
+    _added = field_validator("added", mode="before")(added_rules)
 
     @model_validator(mode="after")
     def _renewed_in_time(self) -> Self:

@@ -18,11 +18,10 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import SENSOR, SENSOR_BELIEVED, guard_kind, guard_rule
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Quality, Reading
-from thermostand.stand.config.chamber_section import FrozenConfig
 from thermostand.stand.config.guard_section import SensorsConfig
 from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.interlocks import SENSOR_STALE
-from thermostand.stand.guarding.plausibility import SENSOR_STUCK
+from thermostand.stand.guarding.stuck_sensor import FINE_STEP_K, SENSOR_STUCK
 
 SENSOR_JUMPED = guard_rule("sensor_jumped", "a temperature jumped by more than a body can", SENSOR)
 SENSOR_OUTSIDE = guard_rule("sensor_outside", "a temperature is where it cannot be", SENSOR)
@@ -40,6 +39,9 @@ and the warmest camera 25 K above the air. In a gap a body of lag L can go no fu
 _CHIP_K, _CHIP_LAG_S = 40.0, 60.0
 """A chip on its board warms by so much within some minutes of switching on, and loses it as fast: those of the
 published cameras go up to 22 K, with lags between 40 and 130 s."""
+_JUMP_WITHIN_S = 15.0  # three polls of the slowest kind: in a longer gap a body may go further
+_STUCK_AFTER_S = 900.0  # exactly constant in fine steps: longer than any noise of a converter rests
+_STALE_AFTER_S, _AIR_MOVES_K = 600.0, 3.0  # a camera that has not moved so long after its air went so far is stale
 LEAST_LAG_S = 10.0  # of a Pt100 in moving air
 _SLOW_S = 100.0  # a body with at least this lag cannot run away within a minute, one with less can
 _WINDOW_S = 60.0  # over which a slow body's rate is looked at
@@ -119,16 +121,9 @@ class _Seen:
 class ChannelCheck:
     """All channels of a stand, by `natures`; a reading of any other passes. publish: takes the events."""
 
-    def __init__(
-        self,
-        natures: Mapping[str, Nature],
-        sensors: SensorsConfig,
-        frozen: FrozenConfig,
-        publish: Callable[[Event], None],
-    ) -> None:
+    def __init__(self, natures: Mapping[str, Nature], sensors: SensorsConfig, publish: Callable[[Event], None]) -> None:
         self._natures = natures
         self._sensors = sensors
-        self._frozen = frozen
         self._publish = publish
         self._seen: dict[str, _Seen] = {}
         self._jumped_ns: dict[str, int] = {}
@@ -216,7 +211,7 @@ class ChannelCheck:
     def _allowed_K(self, seen: _Seen, nature: Nature, time_ns: int) -> float:
         """How far one reading may be from where the last ones lead: a step of the display, what a longer gap leaves
         room for, and as far as its surroundings have gone while it stood still."""
-        gap_s = max(0.0, (time_ns - seen.time_ns) / NS_PER_S - self._sensors.jump_within_s)
+        gap_s = max(0.0, (time_ns - seen.time_ns) / NS_PER_S - _JUMP_WITHIN_S)
         still_s = (time_ns - seen.changed_ns) / NS_PER_S
         went_K = max(0.0, seen.followed_degC[1] - seen.followed_degC[0]) * _share(still_s, nature.lag_s)
         own_K = _own_K(seen, nature, seen.time_ns, time_ns)
@@ -300,20 +295,20 @@ class ChannelCheck:
     def _stuck(self, channel: str, seen: _Seen, nature: Nature, fine_K: float) -> _Doubted | None:
         """Exactly constant: for long, where the device shows steps so fine that noise must move it; or since what it
         follows has gone so far that it must have gone several steps, too."""
-        frozen, still_s = self._frozen, (seen.time_ns - seen.changed_ns) / NS_PER_S
-        if fine_K <= frozen.step_K and still_s >= self._sensors.stuck_after_s:
-            text = f"{channel} has been exactly {seen.value:.3f} degC for {self._sensors.stuck_after_s:g} s"
+        still_s = (seen.time_ns - seen.changed_ns) / NS_PER_S
+        if fine_K <= FINE_STEP_K and still_s >= _STUCK_AFTER_S:
+            text = f"{channel} has been exactly {seen.value:.3f} degC for {_STUCK_AFTER_S:g} s"
             return _Doubted(Fault(SENSOR_STUCK, text, "warn"), seen.time_ns)
         went_K = seen.followed_degC[1] - seen.followed_degC[0]
         step_K = 0.0 if math.isinf(seen.step_K) else seen.step_K
-        share = _share(frozen.camera_after_s, nature.lag_s)
-        needed_K = _STEPS_BEHIND * step_K / _share(frozen.camera_after_s, _SLOWER * nature.lag_s)
+        share = _share(_STALE_AFTER_S, nature.lag_s)
+        needed_K = _STEPS_BEHIND * step_K / _share(_STALE_AFTER_S, _SLOWER * nature.lag_s)
         if nature.excess_K is not None and (seen.time_ns - seen.begin_ns) / NS_PER_S < _YOUNG_LAGS * nature.lag_s:
             needed_K *= max(1.0, step_K / _FINE_STEP_K)
-        if not went_K >= max(frozen.air_moves_K / min(1.0, 1.6 * share), needed_K):
+        if not went_K >= max(_AIR_MOVES_K / min(1.0, 1.6 * share), needed_K):
             return None
         seen.went_ns = seen.went_ns or seen.time_ns
-        if (seen.time_ns - seen.went_ns) / NS_PER_S < frozen.camera_after_s:
+        if (seen.time_ns - seen.went_ns) / NS_PER_S < _STALE_AFTER_S:
             return None
         text = f"{channel} stays at {seen.value:g} while {nature.follows} went by {went_K:.1f} K; it is stale"
         return _Doubted(Fault(SENSOR_STALE, text, "warn"), seen.time_ns)

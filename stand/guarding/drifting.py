@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.events import SENSOR, guard_rule
-from thermostand.stand.fault import Fault, Readings, value_of
-from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.fault import Fault, Readings, Rule, value_of
 from thermostand.stand.guarding.plausibility import remembering
 from thermostand.stand.guarding.suspects import Suspicion
 

@@ -14,8 +14,10 @@ from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import DeviceError
 from thermostand.foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, NOTIFY_FAILED, guard_rule
 from thermostand.foundation.hub import Hub
-from thermostand.stand.fault import Fault
-from thermostand.stand.guarding.interlocks import NOT_RECORDED, Watch
+from thermostand.stand.fault import Fault, Watch
+from thermostand.stand.guarding.interlocks import (
+    NOT_RECORDED,
+)
 from thermostand.stand.guarding.met_errors import MetErrors
 from thermostand.stand.guarding.notify import Notifier
 from thermostand.stand.latch import Latch

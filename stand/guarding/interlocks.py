@@ -1,16 +1,15 @@
-"""The guard's rules that need the latest readings only, what a rule is, and how long one must object to be believed."""
+"""The guard's rules that need the latest readings only."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Protocol
 
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.events import CONNECTED, SENSOR, guard_rule
 from thermostand.foundation.readings import Quality
-from thermostand.stand.fault import Action, Fault, Readings, value_of
+from thermostand.stand.fault import Fault, Readings, Rule, value_of
 
 OVER_TEMPERATURE = guard_rule("over_temperature", "a temperature is above its limit")
 SENSOR_MISSING = guard_rule("sensor_missing", "a temperature that heat depends on was never read", CONNECTED)
@@ -45,40 +44,6 @@ FOLDER_LOST = guard_rule("folder_lost", "the folder of the session is not there 
 RECORDING_ENDED = guard_rule("recording_ended", "the process that writes the session has ended")
 _CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to clear that
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
-
-
-Rule = Callable[[Readings, int], Fault | None]
-
-
-@dataclass(slots=True)
-class Watch:
-    """A rule, how long it must object without a break before it counts (s), and what is then done.
-
-    objection: the rule's at the last check, within its grace time, too. after_gap_s: for so long after a look that came
-    late its objection does not count, because it judges by how old something is that could not be renewed meanwhile.
-    Permits wait for fresh readings all that time.
-    """
-
-    rule: Rule
-    grace_s: float = 0.0
-    action: Action = "abort"
-    since_ns: int | None = None
-    objection: Fault | None = None
-    ends_itself: bool = False
-    after_gap_s: float = 0.0
-
-    def check(self, readings: Readings, now_ns: int) -> Fault | None:
-        """The rule's fault once it has stood for the grace time."""
-        fault = self.objection = self.rule(readings, now_ns)
-        if fault is None:
-            self.since_ns = None
-            return None
-        if self.since_ns is None:
-            self.since_ns = now_ns
-        if now_ns - self.since_ns < seconds_ns(self.grace_s):
-            return None
-        lasting = f", for {self.grace_s:g} s" if self.grace_s > 0 else ""
-        return replace(fault, text=fault.text + lasting, action=self.action, ends_itself=self.ends_itself)
 
 
 def over_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False) -> Rule:

@@ -8,22 +8,56 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
-from thermostand.foundation.events import SENSOR, guard_rule
+from thermostand.foundation.events import guard_rule
 from thermostand.foundation.readings import Reading
-from thermostand.stand.config.guard_section import CoolingConfig, HeaterOffConfig, HeatingConfig
-from thermostand.stand.fault import Fault, Readings, in_doubt, value_of
-from thermostand.stand.guarding.interlocks import Rule
-from thermostand.stand.guarding.surroundings import Surroundings
+from thermostand.stand.config.guard_section import CoolingConfig, HeaterOffConfig
+from thermostand.stand.fault import Fault, Readings, Rule, in_doubt, value_of
 
-HEATER_NOT_WARMING = guard_rule("heater_not_warming", "heat is given and the air does not warm")
 WARMING_WHILE_OFF = guard_rule("warming_while_off", "the air warms though nothing heats")
 COOLING_IN_VAIN = guard_rule("cooling_in_vain", "cold is given and the air does not cool")
-SENSOR_STUCK = guard_rule("sensor_stuck", "a temperature stays exactly where it is while another moves", SENSOR)
+_OFF_SETTLE_S, _ABOVE_SURROUNDINGS_K = 120.0, 5.0
+"""So long after the heat went off its element, lag 25 s, and the walls may still warm the air; so far above all that
+surrounds it, nothing but heat keeps it."""
+_MARGIN_K = 2.0  # above its surroundings: nearer, what is warm around may balance the cold
 Memory = TypeVar("Memory")
+
+# What could warm the air other than its heater: the laboratory and the granite inside, as far as they are measured; a
+# granite without a thermometer by the air that it follows.
+Surroundings = Callable[[Readings, int], tuple[float, ...]]  # degC at an instant, NaN what is not known
+
+
+def measured(*channels: str) -> Surroundings:
+    """What these channels read."""
+    return lambda readings, now_ns: tuple(value_of(readings, channel) for channel in channels)
+
+
+class Following:
+    """A body that follows `air` with a lag. It begins as warm as the air may have been before anybody looked, so that
+    an error of the begin excuses too much and never too little; unknown air leaves it as it is."""
+
+    def __init__(self, air: str, lag_s: float, warmest_degC: float) -> None:
+        self._air = air
+        self._lag_s = lag_s
+        self._degC = warmest_degC
+        self._looked_ns: int | None = None
+
+    def __call__(self, readings: Readings, now_ns: int) -> tuple[float, ...]:
+        """As Surroundings: where it has come to by now."""
+        air_degC, before_ns = value_of(readings, self._air), self._looked_ns
+        self._looked_ns = now_ns
+        if before_ns is not None and not math.isnan(air_degC):
+            share = 1.0 - math.exp(-max(0, now_ns - before_ns) / NS_PER_S / self._lag_s)
+            self._degC += share * (air_degC - self._degC)
+        return (self._degC,)
+
+
+def together(*each: Surroundings) -> Surroundings:
+    """All of them."""
+    return lambda readings, now_ns: tuple(value for one in each for value in one(readings, now_ns))
 
 
 def remembering(step: Callable[[Memory | None, Readings, int], tuple[Memory | None, Fault | None]]) -> Rule:
@@ -58,67 +92,6 @@ class Scatter:
 
 
 @dataclass(frozen=True, slots=True)
-class Heating:
-    """Where the check of one stretch of heating stands."""
-
-    set_point_degC: float
-    checked_ns: int
-    goal_degC: float
-    deadline_ns: int
-    error_K_s: float = 0.0
-    approaching: bool = True
-    first_goal: bool = True
-
-
-def heating(
-    last: Heating | None, limits: HeatingConfig, set_point_degC: float, pv_degC: float, now_ns: int
-) -> Heating | None:
-    """The check after one more look at a heater that is on; None near the set-point, where all is well.
-
-    Klipper's verify_heater (klippy/extras/verify_heater.py): the first goal follows a falling temperature down, each
-    goal reached clears the error, a missed deadline ends the approach, and then the error decides. Unlike there, a goal
-    reached late is one: a chamber's window is long.
-    """
-    lacking_K = set_point_degC - limits.hysteresis_K - pv_degC
-    if not lacking_K > 0:
-        return None
-    goal_degC, deadline_ns = pv_degC + limits.gain_K, now_ns + seconds_ns(limits.window_s)
-    if last is None or last.set_point_degC != set_point_degC:
-        return Heating(set_point_degC, now_ns, goal_degC, deadline_ns)
-    if pv_degC >= last.goal_degC:
-        return Heating(set_point_degC, now_ns, goal_degC, deadline_ns, first_goal=False)
-    return replace(
-        last,
-        checked_ns=now_ns,
-        error_K_s=last.error_K_s + lacking_K * (now_ns - last.checked_ns) / NS_PER_S,
-        approaching=last.approaching and now_ns < last.deadline_ns,
-        goal_degC=min(last.goal_degC, goal_degC) if last.first_goal else last.goal_degC,
-    )
-
-
-def heater_not_warming(limits: HeatingConfig, regulator: str, permit: str) -> Rule:
-    """`regulator` heats, the relay `permit` lets the heat through, and the temperature does not rise: a dead heater, an
-    open thermal cut-out, a detached sensor.
-
-    Only a high output with the permit on is looked at: cooling, a resting compressor, or one that runs against little
-    heat, are no fault.
-    """
-    mv_heat, set_point, pv = (f"{regulator}.{quantity}" for quantity in ("mv_heat", "sp", "pv"))
-
-    def step(last: Heating | None, readings: Readings, now_ns: int) -> tuple[Heating | None, Fault | None]:
-        if not (value_of(readings, mv_heat) >= limits.output_percent and value_of(readings, permit) == 1):
-            return None, None
-        pv_degC = value_of(readings, pv)
-        state = heating(last, limits, value_of(readings, set_point), pv_degC, now_ns)
-        if state is None or state.approaching or state.error_K_s < limits.max_error_K_s:
-            return state, None
-        text = f"{pv} {pv_degC:.1f} degC has not risen by {limits.gain_K} K in {limits.window_s:g} s of heating"
-        return state, Fault(HEATER_NOT_WARMING, f"{text} towards {state.set_point_degC:.1f} degC")
-
-    return remembering(step)
-
-
-@dataclass(frozen=True, slots=True)
 class Off:
     """Heat is off since `since_ns`; the lowest air, as `channel` shows it, since it settled, None until then."""
 
@@ -142,7 +115,7 @@ def warming_while_off(
         if value_of(readings, running) == 1 and air_degC <= value_of(readings, set_point):
             return False
         known = [air_degC - degC for degC in around_degC if not math.isnan(degC)]
-        return bool(known) and min(known) > limits.above_surroundings_K
+        return bool(known) and min(known) > _ABOVE_SURROUNDINGS_K
 
     def step(last: Off | None, readings: Readings, now_ns: int) -> tuple[Off | None, Fault | None]:
         around_degC = surroundings(readings, now_ns)  # at each look, for one that follows the air
@@ -153,7 +126,7 @@ def warming_while_off(
         air_degC = value_of(readings, channel)
         if last is None or last.channel != channel:
             return Off(now_ns, channel), None
-        if math.isnan(air_degC) or now_ns - last.since_ns < seconds_ns(limits.settle_s):
+        if math.isnan(air_degC) or now_ns - last.since_ns < seconds_ns(_OFF_SETTLE_S):
             return last, None
         lowest_degC = air_degC if last.lowest_degC is None else min(last.lowest_degC, air_degC)
         state = Off(last.since_ns, channel, lowest_degC)
@@ -185,7 +158,7 @@ def cooling_in_vain(
 
     def step(last: CompressorRun | None, readings: Readings, now_ns: int) -> tuple[CompressorRun | None, Fault | None]:
         air_degC, around_degC = value_of(readings, air), surroundings(readings, now_ns)
-        is_alone = all(degC < air_degC - limits.margin_K for degC in around_degC)
+        is_alone = all(degC < air_degC - _MARGIN_K for degC in around_degC)
         cools = value_of(readings, compressor) == 1 and value_of(readings, mv_heat) <= 0
         if not (cools and is_alone):
             return None, None
@@ -200,35 +173,5 @@ def cooling_in_vain(
             f"{air} stays at {air_degC:.2f} degC though the compressor has run for {limits.window_s:g} s without heat"
         )
         return last, Fault(COOLING_IN_VAIN, text)
-
-    return remembering(step)
-
-
-@dataclass(frozen=True, slots=True)
-class Constant:
-    """A value that has not changed since `since_ns`, and what another sensor read then."""
-
-    value: float
-    since_ns: int
-    other: float
-
-
-def stuck_while_other_moves(channel: str, other: str, moved_K: float, after_s: float) -> Rule:
-    """`channel` has been exactly constant for at least `after_s`, in which `other`, in the same air, went `moved_K`
-    beyond its scatter; one that is in doubt goes nowhere.
-
-    The regulator shows 0.1 K and holds that for an hour, while its output goes from one end to the other to do so:
-    neither a constant value nor an output that moves proves a stuck probe, a second sensor does.
-    """
-    scatter = Scatter(other)
-
-    def step(last: Constant | None, readings: Readings, now_ns: int) -> tuple[Constant | None, Fault | None]:
-        value, other_value, scatter_K = value_of(readings, channel), value_of(readings, other), scatter.most_K(readings)
-        if last is None or value != last.value or in_doubt(readings, other):
-            return Constant(value, now_ns, other_value), None
-        went_K = abs(other_value - last.other)
-        if now_ns - last.since_ns < seconds_ns(after_s) or not went_K >= moved_K + scatter_K:
-            return last, None
-        return last, Fault(SENSOR_STUCK, f"{channel} stays at {value} while {other} went by {went_K:.2f} K")
 
     return remembering(step)

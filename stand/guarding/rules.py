@@ -10,20 +10,16 @@ from thermostand.drivers.devices.regulators.software_regulator import SoftwareRe
 from thermostand.experiments.steps import Capture
 from thermostand.foundation.events import FRAMES_RESUMED, FRAMES_STOPPED
 from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.stand.config.added_rules import added_rule
 from thermostand.stand.config.dew import dew_point_degC
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.fault import Action, Readings, value_of
+from thermostand.stand.fault import Action, Readings, Rule, Watch, value_of
 from thermostand.stand.gate import HELD, OPERATOR, RELEASED
 from thermostand.stand.guarding.channels import LEAST_LAG_S, Nature
 from thermostand.stand.guarding.drifting import drifting
-from thermostand.stand.guarding.felt_air import camera_feels, granite_feels
-from thermostand.stand.guarding.first_heat import first_heat
-from thermostand.stand.guarding.frozen import frozen
-from thermostand.stand.guarding.heat_given import heat_not_felt, too_much_heat
+from thermostand.stand.guarding.heat_balance import heat_not_felt, too_much_heat
 from thermostand.stand.guarding.interlocks import (
     Recording,
-    Rule,
-    Watch,
     camera_temperature_bad,
     contact,
     dewed,
@@ -42,15 +38,19 @@ from thermostand.stand.guarding.interlocks import (
     stopped_while_permitted,
     trustworthy,
 )
-from thermostand.stand.guarding.needed_output import output_not_as_needed
 from thermostand.stand.guarding.plausibility import (
+    Following,
+    Surroundings,
     cooling_in_vain,
-    heater_not_warming,
-    stuck_while_other_moves,
+    measured,
+    together,
     warming_while_off,
 )
-from thermostand.stand.guarding.surroundings import Following, Surroundings, measured, together
+from thermostand.stand.guarding.startup_response import first_heat
+from thermostand.stand.guarding.steady_state_power import output_not_as_needed
+from thermostand.stand.guarding.stuck_sensor import frozen, stuck_while_other_moves
 from thermostand.stand.guarding.suspects import Witnesses, telling
+from thermostand.stand.guarding.thermal_crosscheck import camera_feels, granite_feels
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",
@@ -121,6 +121,7 @@ def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
         *_operations(config, announced),
         *_contacts(config),
         *_dew(config),
+        *(watch for name, each in config.guard.added.items() for watch in added_rule(name).watches(each, config)),
     )
 
 
@@ -148,7 +149,6 @@ def _heat(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
     of control; a relay that does not close or answer, or a compressor that does not cool, can be put right."""
     limits = config.guard
     return (
-        Watch(heater_not_warming(limits.heating, "regulator", PERMIT)),
         Watch(
             telling(
                 warming_while_off(limits.heater_off, AIR, "regulator", PERMIT, _surroundings(config)),
@@ -184,7 +184,7 @@ def _sensors(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
     def apart(channel: str, most_K: float) -> Rule:
         return telling(disagreement(channel, AIR, most_K), (channel, AIR), seen)
 
-    stays = stuck_while_other_moves(PV, AIR, limits.air_moves_K, limits.pv_stuck_after_s)
+    stays = stuck_while_other_moves(PV, AIR)
     return (
         Watch(apart(PV, limits.warn_K), limits.warn_after_s, "warn"),
         Watch(apart(PV, limits.trip_K), limits.trip_after_s),
@@ -215,27 +215,24 @@ def _independent(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
     for its temperature is unknown; but a thermometer that is frozen, and a first heat that arrives elsewhere, are
     found before anything is warm. The camera's own temperature is not required: one that is stale is a warning."""
     limits, chamber = config.guard, config.chamber
-    feels, frost = limits.granite_feels, limits.frozen
+    feels, warms = limits.granite_crosscheck, limits.camera_crosscheck
     module = tuple(f"thermometers.{name}" for name in config.sensors)
     return (
         Watch(too_much_heat(limits.heat_max_Wh_per_h, chamber.heater_W, "regulator", PERMIT)),
-        *(Watch(heat_not_felt(limits.heat_felt, chamber, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
+        *(Watch(heat_not_felt(limits.heat_balance, chamber, probe, "regulator", PERMIT)) for probe in (PV, AIR)),
         *(
             Watch(telling(granite_feels(feels, chamber.granite_lag_s, body, probe), (body, probe), seen))
             for body in granite(config)
             for probe in (PV, AIR)
         ),
         *(
-            Watch(telling(camera_feels(limits.camera_feels, chamber.camera_lag_s, body, probe), (body, probe), seen))
+            Watch(telling(camera_feels(warms, chamber.camera_lag_s, body, probe), (body, probe), seen))
             for body in (f"{name}.temperature" for name in config.cameras)
             for probe in (AIR, PV)
         ),
-        Watch(output_not_as_needed(limits.needed_output, "regulator", PERMIT, COMPRESSOR, FLAP)),
-        *(
-            Watch(frozen(channel, module, frost.step_K, frost.after_s, "regulator"), action="hold")
-            for channel in (AIR, *granite(config))
-        ),
-        Watch(first_heat(limits.first_heat, AIR, "regulator", PERMIT), action="hold"),
+        Watch(output_not_as_needed(limits.steady_state_power, "regulator", PERMIT, COMPRESSOR, FLAP)),
+        *(Watch(frozen(channel, module, "regulator"), action="hold") for channel in (AIR, *granite(config))),
+        Watch(first_heat(limits.startup_response, AIR, "regulator", PERMIT), action="hold"),
     )
 
 

@@ -32,8 +32,11 @@ from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
 from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.fault import Watch
 from thermostand.stand.guarding.guard import Guard
-from thermostand.stand.guarding.interlocks import Watch, over_temperature
+from thermostand.stand.guarding.interlocks import (
+    over_temperature,
+)
 from thermostand.stand.imaging.camera_supply import SupplyLimits
 from thermostand.stand.running.opening.stop import Interrupted, Stop
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of

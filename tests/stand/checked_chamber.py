@@ -53,7 +53,7 @@ class CheckedChamber(Chamber):
             preset = load_document(packaged("optics", shown.preset), CameraPreset)
             self._published = PublishedCamera(preset, self.plant, STEP_s, (), self._draw.randrange(1000))
             self.plant.on_step.append(self._published.step)
-        self.check = ChannelCheck(natures(config), config.guard.sensors, config.guard.frozen, self.said.append)
+        self.check = ChannelCheck(natures(config), config.guard.sensors, self.said.append)
         self._marks = {name: self.check.marking(name) for name in ("regulator", "thermometers", "camera")}
 
     @property

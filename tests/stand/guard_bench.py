@@ -7,10 +7,9 @@ from thermostand.foundation.clock import Clock, VirtualClock, seconds_ns
 from thermostand.foundation.errors import DeviceFault
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
-from thermostand.stand.fault import Fault, Readings
+from thermostand.stand.fault import Fault, Readings, Rule, Watch
 from thermostand.stand.gate import Gate
 from thermostand.stand.guarding.guard import Guard
-from thermostand.stand.guarding.interlocks import Rule, Watch
 from thermostand.stand.guarding.notify import Notifier
 from thermostand.stand.latch import Latch, LatchFile
 from thermostand.stand.safety import Safety

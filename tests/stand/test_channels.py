@@ -11,7 +11,6 @@ from tests.stand.guarded_chamber import CHANNELS, Action, Chamber, timed
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Quality, Reading
-from thermostand.stand.config.chamber_section import FrozenConfig
 from thermostand.stand.config.guard_section import SensorsConfig
 from thermostand.stand.guarding.channels import ChannelCheck, Nature
 
@@ -110,7 +109,7 @@ class Fed:
     def __init__(self, excess_K: tuple[float, float]) -> None:
         self.said: list[Event] = []
         natures = {AIR: Nature((-40, 100)), CAMERA: Nature((-40, 120), 600.0, AIR, excess_K)}
-        check = ChannelCheck(natures, SensorsConfig(), FrozenConfig(), self.said.append)
+        check = ChannelCheck(natures, SensorsConfig(), self.said.append)
         self._marks = {name: check.marking(name) for name in natures}  # each a device of its own
         self._now_s = 0
 

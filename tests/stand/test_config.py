@@ -81,7 +81,7 @@ def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
         ("guard.cooling.fall_K", 0, "guard.cooling.fall_K: must be greater than 0"),
         ("flap.poll_s", 151, "guard.flap_open_s must be at least twice flap.poll_s (151.0 s)"),
         ("guard.max_camera_degC", float("inf"), "guard.max_camera_degC: must be a finite number"),
-        ("guard.heating.gain_K", 0, "guard.heating.gain_K: must be greater than 0"),
+        ("guard.heater_off.rise_K", 0, "guard.heater_off.rise_K: must be greater than 0"),
         ("guard.sensors.warn_K", 7, "guard.sensors: warn_K 7.0 is above trip_K 6.0"),
         ("guard.keys_s", 9, "guard.keys_s must be at least twice the poll of regulator and relays (5.0 s)"),
         ("guard.notify", "mail", "guard.notify: give a list: each entry behind a dash"),

@@ -7,10 +7,8 @@ from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Cause, Quality, Reading, bad_reading
-from thermostand.stand.fault import Fault
+from thermostand.stand.fault import Fault, Rule, Watch
 from thermostand.stand.guarding.interlocks import (
-    Rule,
-    Watch,
     camera_temperature_bad,
     contact,
     disagreement,

@@ -8,30 +8,30 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.config.chamber_section import (
-    CameraFeelsConfig,
+    CameraCrosscheckConfig,
     ChamberConfig,
-    FirstHeatConfig,
-    GraniteFeelsConfig,
-    HeatFeltConfig,
-    NeededOutputConfig,
+    GraniteCrosscheckConfig,
+    HeatBalanceConfig,
+    StartupResponseConfig,
+    SteadyStatePowerConfig,
 )
-from thermostand.stand.guarding.felt_air import camera_feels, granite_feels
-from thermostand.stand.guarding.first_heat import first_heat
-from thermostand.stand.guarding.frozen import frozen
-from thermostand.stand.guarding.heat_given import heat_not_felt, too_much_heat
-from thermostand.stand.guarding.interlocks import Rule
-from thermostand.stand.guarding.needed_output import output_not_as_needed
+from thermostand.stand.fault import Rule
+from thermostand.stand.guarding.heat_balance import heat_not_felt, too_much_heat
+from thermostand.stand.guarding.startup_response import first_heat
+from thermostand.stand.guarding.steady_state_power import output_not_as_needed
+from thermostand.stand.guarding.stuck_sensor import frozen
+from thermostand.stand.guarding.thermal_crosscheck import camera_feels, granite_feels
 
 POLL_S = 5
 PV, AIR, GRANITE, CAMERA = "regulator.pv", "thermometers.air", "thermometers.granite_inside", "camera.temperature"
 PERMIT, COMPRESSOR, FLAP = "relays.heater_enable", "relays.compressor", "flap.position"
 GRANITE_LAG_S, CAMERA_LAG_S = 4000, 600
-GRANITE_LIMITS = GraniteFeelsConfig(window_s=60, limit_K=4, share=0.4, change_K=3, change_s=900)
-CAMERA_LIMITS = CameraFeelsConfig(settle_s=1200, window_s=120, limit_K=6, share=0.5, still_air_K=3)
-HEAT = HeatFeltConfig(output_percent=50, fall_K=4, rise_share=0.15, window_s=120, settle_s=60)
+GRANITE_LIMITS = GraniteCrosscheckConfig(limit_K=4, change_K=3)
+CAMERA_LIMITS = CameraCrosscheckConfig(settle_s=1200, limit_K=6)
+HEAT = HeatBalanceConfig(rise_share=0.15)
 CHAMBER = ChamberConfig(heater_W=2000, heat_capacity_Wh_K=13)
-NEEDED = NeededOutputConfig(settle_s=600, mean_s=300, limit_percent=25, band_K=2, near_K=3)
-FIRST = FirstHeatConfig(within_s=120, output_percent=40, rise_K=0.5)
+NEEDED = SteadyStatePowerConfig(settle_s=600, limit_percent=25)
+FIRST = StartupResponseConfig(within_s=120, rise_K=0.5)
 AT_REST = {
     PV: 40.0,
     AIR: 40.0,
@@ -157,7 +157,7 @@ def test_an_output_far_from_what_was_needed():
 
 def test_a_fine_thermometer_without_noise_is_frozen_only_while_the_output_works():
     def rule() -> Rule:
-        return frozen(AIR, (AIR, GRANITE), 0.02, 300, "regulator")
+        return frozen(AIR, (AIR, GRANITE), "regulator")
 
     def noisy(step_K: float) -> Callable[[float], float]:
         return lambda s: 40 + step_K * ((s // POLL_S) % 3)

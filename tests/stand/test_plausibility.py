@@ -11,96 +11,17 @@ from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.stand.config.guard_section import HeaterOffConfig, HeatingConfig
+from thermostand.stand.config.guard_section import HeaterOffConfig
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.plausibility import (
-    Heating,
-    heater_not_warming,
-    heating,
-    stuck_while_other_moves,
+    Following,
+    measured,
+    together,
     warming_while_off,
 )
 from thermostand.stand.guarding.rules import Announcements, watches
-from thermostand.stand.guarding.surroundings import Following, measured, together
-
-LIMITS = HeatingConfig(output_percent=50, hysteresis_K=1.0, gain_K=0.5, window_s=600, max_error_K_s=600)
-LOOK_S = 10.0
-
-
-def looks(pv_degC: Callable[[float], float], set_point_degC: float, until_s: float) -> list[Heating | None]:
-    """The check after each look at a heater that is on all the time."""
-    states: list[Heating | None] = [None]
-    for look in range(round(until_s / LOOK_S)):
-        time_s = look * LOOK_S
-        states.append(heating(states[-1], LIMITS, set_point_degC, pv_degC(time_s), seconds_ns(time_s)))
-    return states[1:]
-
-
-def trips(state: Heating | None) -> bool:
-    return state is not None and not state.approaching and state.error_K_s >= LIMITS.max_error_K_s
-
-
-def first_trip_s(states: list[Heating | None]) -> float | None:
-    return next((index * LOOK_S for index, state in enumerate(states) if trips(state)), None)
-
-
-def test_a_temperature_that_rises_fast_enough_is_fine_for_hours():
-    assert first_trip_s(looks(lambda time_s: 20 + 0.06 * time_s / 60, 60.0, 20_000)) is None
-
-
-def test_a_temperature_that_rises_too_slowly_trips_when_the_window_ends():
-    assert first_trip_s(looks(lambda time_s: 20 + 0.04 * time_s / 60, 60.0, 20_000)) == 600
-
-
-def test_a_temperature_that_stops_rising_trips_one_window_after_its_last_goal():
-    tripped_s = first_trip_s(looks(lambda time_s: 20 + min(10.0, time_s / 60), 60.0, 20_000))
-    assert tripped_s == pytest.approx(600 + 600, abs=2 * LOOK_S)
-
-
-def test_the_first_goal_follows_a_temperature_that_still_falls():
-    """It falls by 1 K in the first minutes, then rises by 0.7 K in what is left of the window."""
-    assert (
-        first_trip_s(looks(lambda time_s: 20 - min(1.0, time_s / 240) + max(0.0, time_s - 240) / 500, 60, 3000)) is None
-    )
-
-
-def test_a_later_goal_does_not_follow():
-    """One goal reached at 100 s; then it falls by 1 K and rises by 0.6 K in the next window."""
-    fallen = looks(
-        lambda time_s: 20.0 if time_s < 100 else 20.6 if time_s < 300 else 19.6 + (time_s - 300) / 600, 60, 900
-    )
-    assert first_trip_s(fallen) == 700
-
-
-def test_near_its_set_point_a_temperature_need_not_rise():
-    assert looks(lambda time_s: 29.1, 30.0, 100) == [None] * 10
-
-
-def test_a_goal_reached_late_is_reached():
-    """0.4 K in the first window, and 1 K below what would be all right: the error is still allowed."""
-    states = looks(lambda time_s: 28.1 + 0.4 * (time_s > 0) + 0.15 * (time_s > 620), 30.0, 700)
-    assert first_trip_s(states) is None
-    assert any(state is not None and not state.approaching for state in states)
-    assert states[-1] is not None
-    assert states[-1].approaching
-
-
-def test_little_that_lacks_is_borne_for_long():
-    """1.1 K below the set-point is 0.1 K too much: 6000 s make up the 600 K s."""
-    assert first_trip_s(looks(lambda time_s: 28.9, 30.0, 20_000)) == pytest.approx(6000, abs=2 * LOOK_S)
-
-
-def test_a_new_set_point_begins_a_new_window():
-    state = looks(lambda time_s: 20.0, 60.0, 590)[-1]
-    again = heating(state, LIMITS, 40.0, 20.0, seconds_ns(595))
-    assert again == Heating(40.0, seconds_ns(595), 20.5, seconds_ns(1195))
-
-
-@pytest.mark.parametrize("missing", [(math.nan, 20.0), (60.0, math.nan)])
-def test_what_is_not_known_is_no_fault(missing: tuple[float, float]):
-    state = looks(lambda time_s: 20.0, 60.0, 590)[-1]
-    assert heating(state, LIMITS, *missing, seconds_ns(2000)) is None
+from thermostand.stand.guarding.stuck_sensor import stuck_while_other_moves
 
 
 def faults_of(night: Night) -> list[tuple[float, Fault]]:
@@ -262,7 +183,7 @@ def publish(hub: Hub, channel: str, value: float) -> None:
 def test_a_regulator_that_holds_its_temperature_is_not_stuck_one_that_misses_a_change_is(
     air_K: Callable[[int], float], found_s: int | None
 ):
-    hub, rule, said_s = Hub(), stuck_while_other_moves(PV, AIR, 1.0, 60.0), list[int]()
+    hub, rule, said_s = Hub(), stuck_while_other_moves(PV, AIR), list[int]()
     publish(hub, PV, 24.0)
     for second in range(0, 4600, 5):
         now_ns, after_s = seconds_ns(second), second - 4000
@@ -279,26 +200,6 @@ def test_a_regulator_that_holds_its_temperature_is_not_stuck_one_that_misses_a_c
 def publish_all(hub: Hub, values: dict[str, float]) -> None:
     for channel, value in values.items():
         publish(hub, channel, value)
-
-
-@pytest.mark.parametrize(
-    ("mv_heat", "permit", "trips"),
-    [(100.0, 1.0, True), (50.0, 1.0, True), (49.0, 1.0, False), (100.0, 0.0, False), (math.nan, 1.0, False)],
-    ids=["heats", "just heats", "hardly heats", "permit off", "output unknown"],
-)
-def test_only_a_heater_that_is_on_must_warm(mv_heat: float, permit: float, trips: bool):
-    hub, rule = Hub(), heater_not_warming(LIMITS, "regulator", PERMIT)
-    publish_all(hub, {"regulator.mv_heat": mv_heat, PERMIT: permit, "regulator.sp": 40.0, PV: 24.0})
-    faults = [rule(hub, seconds_ns(second)) for second in range(0, 2000, 10)]
-    assert any(faults) is trips
-
-
-def test_a_heater_that_pauses_begins_again():
-    hub, rule = Hub(), heater_not_warming(LIMITS, "regulator", PERMIT)
-    publish_all(hub, {PERMIT: 1.0, "regulator.sp": 40.0, PV: 24.0})
-    for second in range(0, 4000, 10):
-        publish(hub, "regulator.mv_heat", 0.0 if second % 500 == 0 else 100.0)
-        assert rule(hub, seconds_ns(second)) is None
 
 
 WELDED = {
@@ -342,7 +243,7 @@ def test_air_that_rises_with_the_heater_off_was_heated_unless_something_else_can
     """From 30 to 36 degC in 500 s, with one look, the first that counts, in which the air could not be read."""
     hub = Hub()
     rule = warming_while_off(
-        HeaterOffConfig(settle_s=120, rise_K=2.0, above_surroundings_K=5.0),
+        HeaterOffConfig(rise_K=2.0),
         AIR,
         "regulator",
         PERMIT,

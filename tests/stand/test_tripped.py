@@ -27,8 +27,7 @@ from thermostand.stand.assembly import assemble
 from thermostand.stand.commands import reached
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.fault import Fault, Readings
-from thermostand.stand.guarding.interlocks import Watch
+from thermostand.stand.fault import Fault, Readings, Watch
 from thermostand.stand.interlock import Interlocked
 from thermostand.stand.latch import UNREADABLE, state_folder
 from thermostand.stand.queueing.host import Host

@@ -65,7 +65,7 @@ HAZARDS = (
             "regulator.ad_error", "thermometer.*", "thermometers.*", "chamber.stuck_degC",
         ),
         (
-            "over_temperature", "sensors_disagree", "air_warmer_than_shown", "sensor_frozen", "too_much_heat",
+            "over_temperature", "sensors_disagree", "air_warmer_than_shown", "too_much_heat",
             "heat_not_felt", "output_not_as_needed", "sensor_bad", "sensor_missing", "sensor_stale", "sensor_stuck",
             "sensor_drifts", "sensor_implausible", "sensor_outside", "sensor_noisy", "sensor_jumped",
         ),
@@ -129,7 +129,7 @@ HAZARDS = (
         "the regulator asks for more; heat arrives elsewhere",
         "damage",
         ("heater.cut_out",),
-        ("first_heat", "heater_not_warming"),
+        ("first_heat", "heat_not_felt"),
         _CUT_OUT,
         ("system/test_guard_wire.test_a_fault_trips_its_rule_in_time_and_the_stand_is_safe",),
         (Trial("heater.cut_out", True, 22.0, 60.0, 900.0, 50.0),),

@@ -32,7 +32,7 @@ EFFECTS = ["sag", "dead_zone", "creep", "stick_slip", "unrepeated", "coarse_sens
 def recorded(optics: str, out: Path) -> Observations:
     data = yaml.safe_load(packaged("", "simulated").read_text())
     data["simulation"]["cameras"] = {"camera": {"optics": optics, "effects": EFFECTS, "drawn": 3}}
-    data["guard"]["camera_feels"] = {"settle_s": 14400, "limit_K": 12}  # of a camera that nobody has measured
+    data["guard"]["camera_crosscheck"] = {"settle_s": 14400, "limit_K": 12}  # of a camera that nobody has measured
     data["chamber"] = {"camera_lag_s": 2000}
     text = yaml.safe_dump(data)
     config, recipe = parse_document(text, StandConfig, "config"), parse_document(RECIPE, Recipe, "recipe")

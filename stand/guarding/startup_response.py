@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.events import guard_rule
-from thermostand.stand.config.chamber_section import FirstHeatConfig
-from thermostand.stand.fault import Fault, Readings, value_of
-from thermostand.stand.guarding.heat_given import heat_percent
-from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.config.chamber_section import StartupResponseConfig
+from thermostand.stand.fault import Fault, Readings, Rule, value_of
+from thermostand.stand.guarding.heat_balance import heat_percent
 from thermostand.stand.guarding.plausibility import remembering
 
 FIRST_HEAT = guard_rule("first_heat", "the first heat is not felt where it is given")
+_HEATS_PERCENT = 40.0  # that no chamber can take without getting warmer
 _LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds
 
 
@@ -30,14 +30,14 @@ class Begin:
     is_passed: bool = False
 
 
-def first_heat(limits: FirstHeatConfig, air: str, regulator: str, permit: str) -> Rule:
+def first_heat(limits: StartupResponseConfig, air: str, regulator: str, permit: str) -> Rule:
     """The regulator heats for the first time, and its value or the chamber's air does not rise: two identical
     regulators with exchanged addresses pass every other probe."""
     pv = f"{regulator}.pv"
 
     def begins(readings: Readings) -> bool:
         lacking_K = value_of(readings, f"{regulator}.sp") - value_of(readings, pv)
-        return lacking_K > _LACKING_K and heat_percent(readings, regulator, permit) >= limits.output_percent
+        return lacking_K > _LACKING_K and heat_percent(readings, regulator, permit) >= _HEATS_PERCENT
 
     def step(last: Begin | None, readings: Readings, now_ns: int) -> tuple[Begin | None, Fault | None]:
         if last is not None and last.is_passed:
@@ -54,7 +54,7 @@ def first_heat(limits: FirstHeatConfig, air: str, regulator: str, permit: str) -
             return replace(state, is_passed=True), None
         if now_ns - state.since_ns < seconds_ns(limits.within_s):
             return state, None
-        if state.sum_percent / state.count < limits.output_percent:
+        if state.sum_percent / state.count < _HEATS_PERCENT:
             return None, None  # too little heat to judge
         rises = " and ".join(
             f"{name} rose by {risen_K:.1f} K" for name, risen_K in zip((pv, air), state.risen_K, strict=True)

@@ -8,16 +8,17 @@ from dataclasses import dataclass, field, replace
 
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.events import guard_rule
-from thermostand.stand.config.chamber_section import NeededOutputConfig
-from thermostand.stand.fault import Fault, Readings, value_of
-from thermostand.stand.guarding.heat_given import heat_percent
-from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.config.chamber_section import SteadyStatePowerConfig
+from thermostand.stand.fault import Fault, Readings, Rule, value_of
+from thermostand.stand.guarding.heat_balance import heat_percent
 from thermostand.stand.guarding.plausibility import remembering
 
 OUTPUT_NOT_AS_NEEDED = guard_rule(
     "output_not_as_needed", "the regulator needs another output than before for the same set-point"
 )
 _FLAP_OPEN_ABOVE = 0.05
+_BAND_K, _MEAN_S = 2.0, 300.0  # at its set-point; the cycles of a relay's output are a minute
+_NEAR_K = 3.0  # a set-point so near needs the same within 10 % in good nights
 _LEARNING = 0.25  # share of a new mean; the first is taken whole
 
 
@@ -41,17 +42,19 @@ class Needs:
     learned: Mapping[Rest, float] = field(default_factory=dict[Rest, float])
 
 
-def nearest(learned: Mapping[Rest, float], rest: Rest, near_K: float) -> float | None:
+def nearest(learned: Mapping[Rest, float], rest: Rest) -> float | None:
     """What was needed at the nearest set-point with the compressor alike; None where nothing near was learned."""
     found = [
         (abs(other.set_point_degC - rest.set_point_degC), percent)
         for other, percent in learned.items()
-        if other.compressor == rest.compressor and abs(other.set_point_degC - rest.set_point_degC) <= near_K
+        if other.compressor == rest.compressor and abs(other.set_point_degC - rest.set_point_degC) <= _NEAR_K
     ]
     return min(found)[1] if found else None
 
 
-def output_not_as_needed(limits: NeededOutputConfig, regulator: str, permit: str, compressor: str, flap: str) -> Rule:
+def output_not_as_needed(
+    limits: SteadyStatePowerConfig, regulator: str, permit: str, compressor: str, flap: str
+) -> Rule:
     """The chamber needs far more, or far less, than it did at about this set-point: a probe that shows too little, or
     holds still, makes the regulator heat on."""
 
@@ -60,7 +63,7 @@ def output_not_as_needed(limits: NeededOutputConfig, regulator: str, permit: str
         off_K = abs(value_of(readings, f"{regulator}.pv") - set_point_degC)
         is_controlled = value_of(readings, f"{regulator}.running") == 1 and value_of(readings, permit) == 1
         is_open = value_of(readings, flap) > _FLAP_OPEN_ABOVE
-        if not (is_controlled and off_K <= limits.band_K) or is_open:
+        if not (is_controlled and off_K <= _BAND_K) or is_open:
             return None
         on = value_of(readings, compressor)
         return None if math.isnan(on) else Rest(set_point_degC, on)
@@ -77,16 +80,16 @@ def output_not_as_needed(limits: NeededOutputConfig, regulator: str, permit: str
         summed = replace(
             last, sum_percent=last.sum_percent + heat_percent(readings, regulator, permit), count=last.count + 1
         )
-        if now_ns - summed.begun_ns < seconds_ns(limits.mean_s):
+        if now_ns - summed.begun_ns < seconds_ns(_MEAN_S):
             return summed, None
         return _judged(summed, rest, limits, regulator)
 
     return remembering(step)
 
 
-def _judged(needs: Needs, rest: Rest, limits: NeededOutputConfig, regulator: str) -> tuple[Needs, Fault | None]:
+def _judged(needs: Needs, rest: Rest, limits: SteadyStatePowerConfig, regulator: str) -> tuple[Needs, Fault | None]:
     mean_percent = needs.sum_percent / needs.count
-    needed_percent = nearest(needs.learned, rest, limits.near_K)
+    needed_percent = nearest(needs.learned, rest)
     state = replace(needs, sum_percent=0.0, count=0)
     if needed_percent is not None and abs(mean_percent - needed_percent) > limits.limit_percent:
         text = f"{regulator} heats by {mean_percent:.0f} % at {rest.set_point_degC:.1f} degC, where the chamber needed"

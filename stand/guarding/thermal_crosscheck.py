@@ -14,15 +14,19 @@ from statistics import fmean
 
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.events import guard_rule
-from thermostand.stand.config.chamber_section import CameraFeelsConfig, GraniteFeelsConfig
-from thermostand.stand.fault import Fault, Readings, value_of
-from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.config.chamber_section import CameraCrosscheckConfig, GraniteCrosscheckConfig
+from thermostand.stand.fault import Fault, Readings, Rule, value_of
 from thermostand.stand.guarding.plausibility import remembering
 
 AIR_WARMER_THAN_SHOWN = guard_rule(
     "air_warmer_than_shown", "a body in the chamber warms as if the air were warmer than shown"
 )
 _COVERAGE = 3.0  # with 1 K of noise in the granite its rate says nothing of the air
+_GRANITE_WINDOW_S, _CAMERA_WINDOW_S = 60.0, 120.0  # of a rate: the camera shows its temperature in steps of 0.25 K
+_GRANITE_SHARE, _CAMERA_SHARE = 0.4, 0.5
+"""What a lag that is a third off, and drawn chambers differ by as much, makes of how far a body is from the air."""
+_CHANGE_S = 900.0  # of what was felt lately: a failure shows within minutes, what is learned of the lag takes longer
+_STILL_AIR_K = 3.0  # air that went so far moves every camera that is not stuck
 _GAP_S = 60.0  # between two readings; after a longer one the window begins again
 
 
@@ -46,11 +50,12 @@ class Felt:
     probe_risen_K: float
     uncertain_K: float = 0.0
 
-    def excess_K(self, limits: GraniteFeelsConfig | CameraFeelsConfig) -> float:
-        """How far the air that is felt is above all that is allowed; below 0 all is well. A probe that rises fast has a
-        lag of its own, and is neither stuck nor outside."""
+    def excess_K(self, limit_K: float, share: float) -> float:
+        """How far the air that is felt is above all that is allowed: limit_K, and that share of how far probe and body
+        are apart; below 0 all is well. A probe that rises fast has a lag of its own, and is neither stuck nor
+        outside."""
         apart_K = abs(self.probe_degC - self.body_degC)
-        allowed_K = limits.limit_K + limits.share * apart_K + max(0.0, self.probe_risen_K) + self.uncertain_K
+        allowed_K = limit_K + share * apart_K + max(0.0, self.probe_risen_K) + self.uncertain_K
         return self.air_degC - self.probe_degC - allowed_K
 
 
@@ -95,37 +100,37 @@ class GraniteSeen:
     lately_K: float | None = None
     lately_apart_K: float = 0.0
 
-    def then(self, looks: tuple[Look, ...], found: Felt, change_s: float) -> GraniteSeen:
+    def then(self, looks: tuple[Look, ...], found: Felt) -> GraniteSeen:
         """What was lately, with one more window in it."""
         above_K, apart_K = found.air_degC - found.probe_degC, found.probe_degC - found.body_degC
         if self.lately_K is None or not self.looks:
             return GraniteSeen(looks, above_K, apart_K)
-        share = min(1.0, (looks[-1].time_ns - self.looks[-1].time_ns) / seconds_ns(change_s))
+        share = min(1.0, (looks[-1].time_ns - self.looks[-1].time_ns) / seconds_ns(_CHANGE_S))
         lately_K = self.lately_K + share * (above_K - self.lately_K)
         return GraniteSeen(looks, lately_K, self.lately_apart_K + share * (apart_K - self.lately_apart_K))
 
-    def change_K(self, found: Felt, limits: GraniteFeelsConfig) -> float:
+    def change_K(self, found: Felt, limits: GraniteCrosscheckConfig) -> float:
         """How far the air that is felt has gone from the probe lately, beyond what is allowed. The error of the lag has
         been there before, and so does not count."""
         if self.lately_K is None:
             return -math.inf
         apart_K = abs(found.probe_degC - found.body_degC - self.lately_apart_K)
-        allowed_K = limits.change_K + limits.share * apart_K + max(0.0, found.probe_risen_K) + found.uncertain_K
+        allowed_K = limits.change_K + _GRANITE_SHARE * apart_K + max(0.0, found.probe_risen_K) + found.uncertain_K
         return found.air_degC - found.probe_degC - self.lately_K - allowed_K
 
 
-def granite_feels(limits: GraniteFeelsConfig, lag_s: float, granite: str, probe: str) -> Rule:
+def granite_feels(limits: GraniteCrosscheckConfig, lag_s: float, granite: str, probe: str) -> Rule:
     """The granite warms as in air that is warmer than `probe` shows, which is stuck, drifts, or hangs outside."""
 
     def step(last: GraniteSeen | None, readings: Readings, now_ns: int) -> tuple[GraniteSeen | None, Fault | None]:
         last = last or GraniteSeen()
-        looks = looked(last.looks, readings, granite, probe, limits.window_s)
-        found = felt(looks, limits.window_s, lag_s)
+        looks = looked(last.looks, readings, granite, probe, _GRANITE_WINDOW_S)
+        found = felt(looks, _GRANITE_WINDOW_S, lag_s)
         if found is None:
             return replace(last, looks=looks), None
-        if found.excess_K(limits) > 0 or last.change_K(found, limits) > 0:
+        if found.excess_K(limits.limit_K, _GRANITE_SHARE) > 0 or last.change_K(found, limits) > 0:
             return replace(last, looks=looks), _objection(found, granite, probe)
-        return last.then(looks, found, limits.change_s), None
+        return last.then(looks, found), None
 
     return remembering(step)
 
@@ -147,37 +152,37 @@ class CameraSeen:
     excesses_K: tuple[float, ...] = ()
     excess_K: float | None = None
 
-    def is_doubted(self, limits: CameraFeelsConfig, air_degC: float) -> bool:
+    def is_doubted(self, air_degC: float) -> bool:
         """Whether the camera did not notice what the air did."""
         still_ns = self.looks[-1].time_ns - self.changed_ns if self.looks else 0
         moved_K = abs(air_degC - self.changed_air_degC)
-        return still_ns >= seconds_ns(limits.window_s) and moved_K >= limits.still_air_K
+        return still_ns >= seconds_ns(_CAMERA_WINDOW_S) and moved_K >= _STILL_AIR_K
 
 
 _EXCESSES = 100  # looks from which the camera's excess is learned
 
 
-def camera_feels(limits: CameraFeelsConfig, lag_s: float, camera: str, air: str) -> Rule:
+def camera_feels(limits: CameraCrosscheckConfig, lag_s: float, camera: str, air: str) -> Rule:
     """The camera, which heats itself by what was learned when it had been on for a while, warms as in air that is
     warmer than `air` shows. Blind while it is off and warms up, and while it does not move though the air does."""
 
     def step(last: CameraSeen | None, readings: Readings, now_ns: int) -> tuple[CameraSeen | None, Fault | None]:
         air_degC = value_of(readings, air)
-        looks = looked(last.looks if last else (), readings, camera, air, limits.window_s)
+        looks = looked(last.looks if last else (), readings, camera, air, _CAMERA_WINDOW_S)
         if not looks:
             return None, None
         if last is None or len(looks) == 1:  # also after it was off
             return CameraSeen(looks[-1].time_ns, looks[-1].time_ns, air_degC, looks), None
         seen = _seen(last, looks)
-        if seen.is_doubted(limits, air_degC):
+        if seen.is_doubted(air_degC):
             return seen, None
-        found = felt(looks, limits.window_s, lag_s)
+        found = felt(looks, _CAMERA_WINDOW_S, lag_s)
         if found is None or looks[-1].time_ns - seen.on_since_ns < seconds_ns(limits.settle_s):
             return seen, None
         if seen.excess_K is None:
             return (seen if seen is last else _learned(seen, found)), None
         own = replace(found, air_degC=found.air_degC - seen.excess_K, body_degC=found.body_degC - seen.excess_K)
-        return seen, _objection(own, camera, air) if own.excess_K(limits) > 0 else None
+        return seen, _objection(own, camera, air) if own.excess_K(limits.limit_K, _CAMERA_SHARE) > 0 else None
 
     return remembering(step)
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.events import guard_rule
-from thermostand.stand.config.chamber_section import ChamberConfig, HeatFeltConfig
-from thermostand.stand.fault import Fault, Readings, value_of
-from thermostand.stand.guarding.interlocks import Rule
+from thermostand.stand.config.chamber_section import ChamberConfig, HeatBalanceConfig
+from thermostand.stand.fault import Fault, Readings, Rule, value_of
 from thermostand.stand.guarding.plausibility import remembering
 
 HEAT_NOT_FELT = guard_rule("heat_not_felt", "the regulator heats hard, and a probe does not show it")
@@ -17,6 +16,10 @@ TOO_MUCH_HEAT = guard_rule("too_much_heat", "more heat was given within an hour 
 _LONGEST_LOOK_S = 60.0  # between two looks; what was given in a longer gap is not known
 _BEFORE_S = 30.0  # a stretch of heat begins: from here on a fall counts
 _MINUTE_S = 60.0
+HARD_PERCENT = 50.0
+"""More than any rest needs: at such an output the air must warm."""
+_WINDOW_S, _SETTLE_S = 120.0, 60.0  # over which it must rise, once the heater's own lag of 25 s is over
+_FALL_K = 4.0  # from its highest; good nights fall by 1.5 K, when a ramp passes a capture's open flap
 
 
 def heat_percent(readings: Readings, regulator: str, permit: str) -> float:
@@ -74,10 +77,10 @@ class Stretch:
     highest_degC: float = -math.inf
 
 
-def heat_not_felt(limits: HeatFeltConfig, chamber: ChamberConfig, probe: str, regulator: str, permit: str) -> Rule:
+def heat_not_felt(limits: HeatBalanceConfig, chamber: ChamberConfig, probe: str, regulator: str, permit: str) -> Rule:
     """The regulator heats hard, and yet `probe` falls, or does not rise as that heat makes it: it hangs outside, or is
     stuck. Near the set-point, where the heat only keeps what is there, a rise is not asked for."""
-    kept_ns = seconds_ns(max(limits.window_s, _BEFORE_S))
+    kept_ns = seconds_ns(max(_WINDOW_S, _BEFORE_S))
 
     def step(last: Stretch | None, readings: Readings, now_ns: int) -> tuple[Stretch | None, Fault | None]:
         reading = readings.known(probe)
@@ -98,9 +101,9 @@ def heat_not_felt(limits: HeatFeltConfig, chamber: ChamberConfig, probe: str, re
     return remembering(step)
 
 
-def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatFeltConfig) -> Stretch:
+def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatBalanceConfig) -> Stretch:
     now = moments[-1]
-    if now.percent < limits.output_percent:
+    if now.percent < HARD_PERCENT:
         return Stretch(moments)
     if last is None or last.since_ns is None:
         begun_ns = now.time_ns - seconds_ns(_BEFORE_S)
@@ -108,21 +111,21 @@ def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatFelt
     return Stretch(moments, last.since_ns, max(last.highest_degC, now.probe_degC))
 
 
-def _fallen(stretch: Stretch, limits: HeatFeltConfig, probe: str) -> Fault | None:
+def _fallen(stretch: Stretch, limits: HeatBalanceConfig, probe: str) -> Fault | None:
     now = stretch.moments[-1]
-    if stretch.highest_degC - now.probe_degC < limits.fall_K:
+    if stretch.highest_degC - now.probe_degC < _FALL_K:
         return None
     text = f"{probe} falls from {stretch.highest_degC:.1f} to {now.probe_degC:.1f} degC while the regulator heats"
     return Fault(HEAT_NOT_FELT, f"{text} by {now.percent:.0f} %")
 
 
 def _not_risen(
-    stretch: Stretch, limits: HeatFeltConfig, chamber: ChamberConfig, probe: str, readings: Readings, regulator: str
+    stretch: Stretch, limits: HeatBalanceConfig, chamber: ChamberConfig, probe: str, readings: Readings, regulator: str
 ) -> Fault | None:
     first, now = stretch.moments[0], stretch.moments[-1]
     lasted_s = (now.time_ns - first.time_ns) / NS_PER_S
-    settled_ns = (stretch.since_ns or 0) + seconds_ns(limits.settle_s)
-    if lasted_s < 0.9 * limits.window_s or first.time_ns < settled_ns:
+    settled_ns = (stretch.since_ns or 0) + seconds_ns(_SETTLE_S)
+    if lasted_s < 0.9 * _WINDOW_S or first.time_ns < settled_ns:
         return None
     lacking_K = value_of(readings, f"{regulator}.sp") - value_of(readings, f"{regulator}.pv")
     if not lacking_K > 1.0:

@@ -1,0 +1,109 @@
+"""A rule of the guard that another package adds is found everywhere by its one file."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.events import GUARD, KINDS, Alert, alert_of
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Reading
+from thermostand.stand.assembly import assemble
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.fault import Fault
+from thermostand.stand.watching.remedies import next_command, troubleshooting
+
+MODULE = """
+from pydantic import Field
+from thermostand.foundation.documents import Document
+from thermostand.stand.config.added_rules import GuardRule
+from thermostand.stand.fault import Fault, Watch, value_of
+
+class Settings(Document):
+    limit_degC: float = Field(default=30.0, le=40)
+    for_s: float = Field(default=0.0, ge=0)
+
+def watches(settings, config):
+    def rule(readings, now_ns):
+        value_degC = value_of(readings, "thermometers.laboratory")
+        if value_degC > settings.limit_degC:
+            return Fault("room_hot", f"the room of {config.name} is {value_degC:.1f} degC")
+        return None
+    return [Watch(rule, settings.for_s, "hold")]
+
+RULE = GuardRule("room_hot", "the laboratory is too warm", Settings, watches, "open a window")
+"""
+
+
+@pytest.fixture(autouse=True)
+def room_hot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The package, installed; nothing of this program knows it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "acme_room.py").write_text(MODULE)
+    info = tmp_path / "acme_room-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-room\nVersion: 1.0\n")
+    points = "room_hot = acme_room:RULE\nroom_cold = acme_none:RULE\nroom_wet = acme_room:RULE\n"
+    (info / "entry_points.txt").write_text(f"[thermostand.guard_rules]\n{points}")
+    yield
+    KINDS.pop(f"{GUARD}room_hot", None)
+    sys.modules.pop("acme_room", None)
+
+
+def config_with(**added: object) -> StandConfig:
+    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data["guard"]["added"] = added
+    return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
+
+
+def test_the_stands_file_has_its_settings_checked_and_written_again():
+    config = config_with(room_hot={"limit_degC": 28.0})
+    assert config.model_dump()["guard"]["added"] == {"room_hot": {"limit_degC": 28.0, "for_s": 0.0}}
+    assert config_with(room_hot=None).model_dump()["guard"]["added"]["room_hot"]["limit_degC"] == 30.0
+
+
+@pytest.mark.parametrize(
+    ("added", "sentence"),
+    [
+        ({"room_hot": {"limit_degC": 50}}, "guard.added: limit_degC: must be less than or equal to 40"),
+        ({"room_hot": {"limit": 30}}, r"guard.added: .*limit"),
+        ({"too_dark": {}}, r"guard.added: no package adds a rule 'too_dark'; there are room_cold, room_hot, room_wet"),
+        ({"room_cold": {}}, r"guard.added: room_cold: acme-room 1.0 cannot be loaded .*; reinstall it"),
+        ({"room_wet": {}}, "guard.added: room_wet: acme-room 1.0 has no GuardRule of that name there"),
+    ],
+)
+def test_what_is_wrong_with_it_is_said(added: dict[str, object], sentence: str):
+    with pytest.raises(ConfigError, match=sentence):
+        config_with(**added)
+
+
+async def test_it_trips_and_its_event_has_advice_alert_and_row():
+    config, hub, clock = config_with(room_hot={"limit_degC": 28.0}), Hub(), VirtualClock(0)
+    assembly, held, said = assemble(config, hub, clock), list[Fault](), list[Event]()
+    hub.subscribe(lambda item: said.append(item) if isinstance(item, Event) else None)
+    guard = assembly.guard(held.append, held.append)
+    (watch,) = [each for each in guard.watches if each.rule.__module__ == "acme_room"]
+    guard.watches = (watch,)
+    for degC, trips in ((27.0, []), (29.0, ["room_hot"])):
+        reading = Reading("thermometers.laboratory", degC, "degC", seconds_ns(1))
+        hub.publish(Batch("thermometers", seconds_ns(1), (reading,)))
+        guard.look()
+        assert [fault.rule for fault in held] == trips
+    assert assembly.stand.latch.fault == held[0]
+    (trip,) = [event for event in said if event.kind == f"{GUARD}room_hot"]
+    assert (trip.level, trip.text, alert_of(trip)) == (
+        "error",
+        f"the room of {config.name} is 29.0 degC",
+        Alert("hold", "guard", "lasting"),
+    )
+    assert next_command(trip.kind, trip.data)
+    assert "| `guard.room_hot` that only warns | warning | the laboratory is too warm | open a window |" in (
+        troubleshooting()
+    )
+    await assembly.stand.safety.close()
