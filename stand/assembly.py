@@ -140,14 +140,32 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         regulator.permitted = lambda: stand.chamber.permits.gives
     check = ChannelCheck(natures(config), config.guard.sensors, hub.publish)
     stand.imaging.doubt_of = check.doubt_of
-    return Assembly(config, hub, clock, bus, devices, stand, equipment, notifier, check)
+    return Assembly(
+        config=config,
+        hub=hub,
+        clock=clock,
+        bus=bus,
+        devices=devices,
+        stand=stand,
+        equipment=equipment,
+        notifier=notifier,
+        channels=check,
+    )
 
 
 def make_devices(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> Devices:
     """Every device of the stand's file, not opened; ConfigError when a register map is missing or wrong, or that of
     another kind of unit."""
     made: dict[str, Sensor] = {}
-    around = Around(clock, bus, made, hub.publish, hub.known, partial(getattr, config), register_map)
+    around = Around(
+        clock=clock,
+        bus=bus,
+        made=made,
+        publish=hub.publish,
+        known=hub.known,
+        of_section=partial(getattr, config),
+        map_of=register_map,
+    )
     by_kind: dict[str, dict[str, Any]] = {}
     # What controls comes last: it may heat by another device.
     for each in sorted(config.equipment, key=lambda each: each.kind.device == "regulator"):

@@ -119,7 +119,7 @@ class Phase(StrEnum):
     ENDED = "ended"
 
 
-class Turn(StrEnum):
+class PhaseTurn(StrEnum):
     """What moves a run from phase to phase."""
 
     START = "start"
@@ -131,17 +131,21 @@ class Turn(StrEnum):
 
 
 # What is not in a row changes nothing: a run that is being aborted cannot be held, one that has ended stays so.
-_LAST: dict[Turn, Phase] = {Turn.STOP: Phase.ABORTING, Turn.TAKE_DOWN: Phase.ENDING, Turn.END: Phase.ENDED}
-_NEXT: dict[Phase, dict[Turn, Phase]] = {
-    Phase.IDLE: {Turn.START: Phase.RUNNING, **_LAST},
-    Phase.RUNNING: {Turn.HOLD: Phase.HELD, **_LAST},
-    Phase.HELD: {Turn.RELEASE: Phase.RUNNING, **_LAST},
-    Phase.ABORTING: {Turn.TAKE_DOWN: Phase.ENDING, Turn.END: Phase.ENDED},
-    Phase.ENDING: {Turn.END: Phase.ENDED},
+_LAST: dict[PhaseTurn, Phase] = {
+    PhaseTurn.STOP: Phase.ABORTING,
+    PhaseTurn.TAKE_DOWN: Phase.ENDING,
+    PhaseTurn.END: Phase.ENDED,
+}
+_NEXT: dict[Phase, dict[PhaseTurn, Phase]] = {
+    Phase.IDLE: {PhaseTurn.START: Phase.RUNNING, **_LAST},
+    Phase.RUNNING: {PhaseTurn.HOLD: Phase.HELD, **_LAST},
+    Phase.HELD: {PhaseTurn.RELEASE: Phase.RUNNING, **_LAST},
+    Phase.ABORTING: {PhaseTurn.TAKE_DOWN: Phase.ENDING, PhaseTurn.END: Phase.ENDED},
+    Phase.ENDING: {PhaseTurn.END: Phase.ENDED},
     Phase.ENDED: {},
 }
 
 
-def next_phase(phase: Phase, turn: Turn) -> Phase:
+def next_phase(phase: Phase, turn: PhaseTurn) -> Phase:
     """The phase after `turn`."""
     return _NEXT[phase].get(turn, phase)

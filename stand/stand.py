@@ -90,9 +90,34 @@ class Stand:
         self.latch = Latch(self.gate, hub, clock)
         self.interlock = interlock = Interlock(self.latch, self.gate, (devices.flap, *devices.axes.values()))
         cameras = Cameras(devices.cameras)
-        power = CameraSupply(cameras, devices.relays, supply, interlock, self.gate, hub, clock)
-        self.imaging = Imaging(devices.cameras, devices.flap, power, interlock, self.gate, self.motions, hub, clock)
-        self.chamber = Chamber(devices.regulator, devices.relays, chamber, interlock, power.compare, hub, clock)
+        power = CameraSupply(
+            cameras=cameras,
+            relays=devices.relays,
+            limits=supply,
+            interlock=interlock,
+            gate=self.gate,
+            hub=hub,
+            clock=clock,
+        )
+        self.imaging = Imaging(
+            cameras=devices.cameras,
+            flap=devices.flap,
+            supply=power,
+            interlock=interlock,
+            gate=self.gate,
+            motions=self.motions,
+            hub=hub,
+            clock=clock,
+        )
+        self.chamber = Chamber(
+            regulator=devices.regulator,
+            relays=devices.relays,
+            limits=chamber,
+            interlock=interlock,
+            coils_read=power.compare,
+            hub=hub,
+            clock=clock,
+        )
         self.table = Table(devices.axes, interlock, self.motions, hub, clock)
         self.safety = Safety(self.chamber.permits.revoke, hub, clock)
 

@@ -52,6 +52,7 @@ class Chamber:
 
     def __init__(
         self,
+        *,
         regulator: Controller,
         relays: Switches,
         limits: ChamberLimits,

@@ -21,7 +21,7 @@ from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.reached import ConfigOption
 from thermostand.stand.commissioning.commissioning import commission
 from thermostand.stand.commissioning.genicam_rehearsal import rehearse
-from thermostand.stand.commissioning.record import Record
+from thermostand.stand.commissioning.record import CommissioningRecord
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.running.order import register_texts
 
@@ -59,7 +59,7 @@ def check(
     clock = WallClock()
     began_ns = clock.now_ns()
     found, identities = asyncio.run(commission(stand, _nothing if output().as_json else _tell, has_moves=moves))
-    record = Record(stand, str(path), texts, began_ns, clock.now_ns(), moves, found, identities)
+    record = CommissioningRecord(stand, str(path), texts, began_ns, clock.now_ns(), moves, found, identities)
     kept = "not kept, since this is an installed file; copy it to have a stand of your own"
     if not _is_installed(path):
         _, page = record.write(path)
@@ -102,7 +102,7 @@ def _summary(findings: tuple[Finding, ...], kept: str, *, moves: bool) -> str:
     counts = [(sum(each.verdict == verdict for each in findings), word) for verdict, word in words.items()]
     text = ", ".join(f"{count} {word}" for count, word in counts if count) or "all well"
     unmoved = "" if moves else "; nothing was moved: --moves tries flap, stages, cameras and the heat's timer"
-    return f"{text}{unmoved}. Record: {kept}"
+    return f"{text}{unmoved}. CommissioningRecord: {kept}"
 
 
 def _is_installed(path: Path) -> bool:

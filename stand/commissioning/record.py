@@ -25,7 +25,7 @@ SCHEMA = "stand-check/1"
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class CommissioningRecord:
     """One check. texts: the stand's file and its register maps, by the names under which sessions have them."""
 
     config: StandConfig

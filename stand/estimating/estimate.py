@@ -109,14 +109,14 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
         size_bytes = frame_px * _image_bytes_per_px(step, frames, config) + duration_s * telemetry_bytes_per_s
         priced.append(
             PricedStep(
-                planned,
-                duration_s,
-                frames,
-                size_bytes,
-                expected.work,
-                expected.stated_s,
-                in_band_after_s,
-                _warning(step, approach, learned.chamber, expected.stated_s)
+                planned=planned,
+                duration_s=duration_s,
+                frames=frames,
+                size_bytes=size_bytes,
+                work=expected.work,
+                stated_s=expected.stated_s,
+                in_band_after_s=in_band_after_s,
+                warning=_warning(step, approach, learned.chamber, expected.stated_s)
                 or _in_the_dark(step, found)
                 or _unknown(expected.work, learned),
             )

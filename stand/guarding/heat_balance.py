@@ -60,7 +60,7 @@ def too_much_heat(max_Wh_per_h: float, heater_W: float, regulator: str, permit: 
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class HeatMoment:
     """One look at heat and probe."""
 
     time_ns: int
@@ -72,7 +72,7 @@ class Moment:
 class Stretch:
     """What was seen lately; while the regulator heats, since when, and the highest that the probe showed."""
 
-    moments: tuple[Moment, ...]
+    moments: tuple[HeatMoment, ...]
     since_ns: int | None = None
     highest_degC: float = -math.inf
 
@@ -89,7 +89,7 @@ def heat_not_felt(limits: HeatBalanceConfig, chamber: ChamberConfig, probe: str,
         moments = last.moments if last else ()
         if last and moments and reading.time_ns <= moments[-1].time_ns:
             return last, None
-        now = Moment(reading.time_ns, heat_percent(readings, regulator, permit), reading.value)
+        now = HeatMoment(reading.time_ns, heat_percent(readings, regulator, permit), reading.value)
         moments = (*(each for each in moments if each.time_ns >= now.time_ns - kept_ns), now)
         stretch = _stretch(last, moments, limits)
         if stretch.since_ns is None:
@@ -101,7 +101,7 @@ def heat_not_felt(limits: HeatBalanceConfig, chamber: ChamberConfig, probe: str,
     return remembering(step)
 
 
-def _stretch(last: Stretch | None, moments: tuple[Moment, ...], limits: HeatBalanceConfig) -> Stretch:
+def _stretch(last: Stretch | None, moments: tuple[HeatMoment, ...], limits: HeatBalanceConfig) -> Stretch:
     now = moments[-1]
     if now.percent < HARD_PERCENT:
         return Stretch(moments)

@@ -27,15 +27,15 @@ Memory = TypeVar("Memory")
 
 # What could warm the air other than its heater: the laboratory and the granite inside, as far as they are measured; a
 # granite without a thermometer by the air that it follows.
-Surroundings = Callable[[Readings, int], tuple[float, ...]]  # degC at an instant, NaN what is not known
+WarmAround = Callable[[Readings, int], tuple[float, ...]]  # degC at an instant, NaN what is not known
 
 
-def measured(*channels: str) -> Surroundings:
+def measured(*channels: str) -> WarmAround:
     """What these channels read."""
     return lambda readings, now_ns: tuple(value_of(readings, channel) for channel in channels)
 
 
-class Following:
+class FollowingBody:
     """A body that follows `air` with a lag. It begins as warm as the air may have been before anybody looked, so that
     an error of the begin excuses too much and never too little; unknown air leaves it as it is."""
 
@@ -46,7 +46,7 @@ class Following:
         self._looked_ns: int | None = None
 
     def __call__(self, readings: Readings, now_ns: int) -> tuple[float, ...]:
-        """As Surroundings: where it has come to by now."""
+        """As WarmAround: where it has come to by now."""
         air_degC, before_ns = value_of(readings, self._air), self._looked_ns
         self._looked_ns = now_ns
         if before_ns is not None and not math.isnan(air_degC):
@@ -55,7 +55,7 @@ class Following:
         return (self._degC,)
 
 
-def together(*each: Surroundings) -> Surroundings:
+def together(*each: WarmAround) -> WarmAround:
     """All of them."""
     return lambda readings, now_ns: tuple(value for one in each for value in one(readings, now_ns))
 
@@ -100,9 +100,7 @@ class Off:
     lowest_degC: float | None = None
 
 
-def warming_while_off(
-    limits: HeaterOffConfig, air: str, regulator: str, permit: str, surroundings: Surroundings
-) -> Rule:
+def warming_while_off(limits: HeaterOffConfig, air: str, regulator: str, permit: str, surroundings: WarmAround) -> Rule:
     """The air rises though the regulator's output is 0 or the permit is off: a welded relay or a shorted SSR.
 
     The heater's power cannot be seen. What else can warm the air, the laboratory and what was warm before, cannot bring
@@ -146,9 +144,7 @@ class CompressorRun:
     air_degC: tuple[float, float]
 
 
-def cooling_in_vain(
-    limits: CoolingConfig, air: str, regulator: str, compressor: str, surroundings: Surroundings
-) -> Rule:
+def cooling_in_vain(limits: CoolingConfig, air: str, regulator: str, compressor: str, surroundings: WarmAround) -> Rule:
     """The compressor runs, the regulator's heating output is 0, and yet the air, which nothing around it warms, does
     not fall: a welded relay that heats as much as is cooled, or a compressor that does not cool. The two look alike.
 

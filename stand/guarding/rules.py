@@ -39,8 +39,8 @@ from thermostand.stand.guarding.interlocks import (
     trustworthy,
 )
 from thermostand.stand.guarding.plausibility import (
-    Following,
-    Surroundings,
+    FollowingBody,
+    WarmAround,
     cooling_in_vain,
     measured,
     together,
@@ -236,12 +236,12 @@ def _independent(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
     )
 
 
-def _surroundings(config: StandConfig) -> Surroundings:
+def _surroundings(config: StandConfig) -> WarmAround:
     """What could warm the air."""
     found = measured(*((LABORATORY,) if "laboratory" in config.sensors else ()), *granite(config))
     if granite(config):
         return found
-    return together(found, Following(AIR, config.chamber.granite_lag_s, config.limits.chamber_degC[1]))
+    return together(found, FollowingBody(AIR, config.chamber.granite_lag_s, config.limits.chamber_degC[1]))
 
 
 def natures(config: StandConfig) -> dict[str, Nature]:

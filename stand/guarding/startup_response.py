@@ -18,7 +18,7 @@ _LACKING_K = 1.0  # below its set-point by more than this the regulator heats, n
 
 
 @dataclass(frozen=True, slots=True)
-class Begin:
+class StartupBegin:
     """Heating since `since_ns`, from what `shown_degC` (PV, air) were; the most that each has risen. is_passed: both
     have risen, and nothing is looked at any more."""
 
@@ -39,17 +39,17 @@ def first_heat(limits: StartupResponseConfig, air: str, regulator: str, permit: 
         lacking_K = value_of(readings, f"{regulator}.sp") - value_of(readings, pv)
         return lacking_K > _LACKING_K and heat_percent(readings, regulator, permit) >= _HEATS_PERCENT
 
-    def step(last: Begin | None, readings: Readings, now_ns: int) -> tuple[Begin | None, Fault | None]:
+    def step(last: StartupBegin | None, readings: Readings, now_ns: int) -> tuple[StartupBegin | None, Fault | None]:
         if last is not None and last.is_passed:
             return last, None
         shown_degC = value_of(readings, pv), value_of(readings, air)
         if math.isnan(sum(shown_degC)):
             return None, None
         if last is None:
-            return (Begin(now_ns, shown_degC) if begins(readings) else None), None
+            return (StartupBegin(now_ns, shown_degC) if begins(readings) else None), None
         return _judged(_looked(last, shown_degC, heat_percent(readings, regulator, permit)), readings, now_ns)
 
-    def _judged(state: Begin, readings: Readings, now_ns: int) -> tuple[Begin | None, Fault | None]:
+    def _judged(state: StartupBegin, readings: Readings, now_ns: int) -> tuple[StartupBegin | None, Fault | None]:
         if min(state.risen_K) >= limits.rise_K:
             return replace(state, is_passed=True), None
         if now_ns - state.since_ns < seconds_ns(limits.within_s):
@@ -65,7 +65,7 @@ def first_heat(limits: StartupResponseConfig, air: str, regulator: str, permit: 
     return remembering(step)
 
 
-def _looked(state: Begin, shown_degC: tuple[float, float], percent: float) -> Begin:
+def _looked(state: StartupBegin, shown_degC: tuple[float, float], percent: float) -> StartupBegin:
     risen_K = tuple(
         max(most_K, shown - begun)
         for most_K, shown, begun in zip(state.risen_K, shown_degC, state.shown_degC, strict=True)

@@ -45,6 +45,7 @@ class CameraSupply:
 
     def __init__(
         self,
+        *,
         cameras: Cameras,
         relays: Switches,
         limits: SupplyLimits,

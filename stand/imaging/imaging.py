@@ -26,6 +26,7 @@ class Imaging:
 
     def __init__(
         self,
+        *,
         cameras: Mapping[str, Camera],
         flap: Shutter,
         supply: CameraSupply,

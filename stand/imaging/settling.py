@@ -43,7 +43,7 @@ class Rate:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SettlingSeen:
     """Readings and looks since the soak was last undisturbed, oldest first, times in s.
 
     chamber, camera: (2, n), time and degC, NaN where a reading was BAD. digit_K: of the camera's thermometer, 0 when it
@@ -78,7 +78,7 @@ class Verdict:
         )
 
 
-def judge(seen: Seen, soak: SoakUntilSettled, now_s: float) -> Verdict:
+def judge(seen: SettlingSeen, soak: SoakUntilSettled, now_s: float) -> Verdict:
     """Whether the camera has settled, by the last `soak.window_s` before `now_s`; the soak's age is not judged."""
     camera = camera_rate(_last(seen.camera, now_s - soak.window_s), seen.digit_K)
     slack_s = soak.look_every_s / 2.0
@@ -87,7 +87,7 @@ def judge(seen: Seen, soak: SoakUntilSettled, now_s: float) -> Verdict:
     return Verdict(camera, drift, _missing(seen, soak, now_s, looks, camera, drift))
 
 
-def _missing(seen: Seen, soak: SoakUntilSettled, now_s: float, looks: Float, camera: Rate, drift: Rate) -> str:
+def _missing(seen: SettlingSeen, soak: SoakUntilSettled, now_s: float, looks: Float, camera: Rate, drift: Rate) -> str:
     begin_s = now_s - soak.window_s
     chamber = _last(seen.chamber, begin_s)
     if not _covers(seen.chamber, begin_s) or not (np.abs(chamber[1] - soak.chamber_degC) <= BAND_K).all():

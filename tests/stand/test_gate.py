@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.stand.gate import Gate, Phase, Turn, next_phase
+from thermostand.stand.gate import Gate, Phase, PhaseTurn, next_phase
 
 REASONS = st.sampled_from(["operator", "interlock", "camera_lost", "disk_low"])
 
@@ -63,25 +63,25 @@ async def test_a_hold_for_a_moment_is_not_missed():
 
 @pytest.mark.parametrize("phase", Phase)
 def test_stop_ends_a_run_from_every_phase_and_nothing_brings_it_back(phase: Phase):
-    stopped = next_phase(phase, Turn.STOP)
+    stopped = next_phase(phase, PhaseTurn.STOP)
     assert stopped in (Phase.ABORTING, Phase.ENDING, Phase.ENDED)
-    for turns in itertools.product((Turn.START, Turn.HOLD, Turn.RELEASE, Turn.STOP), repeat=2):
+    for turns in itertools.product((PhaseTurn.START, PhaseTurn.HOLD, PhaseTurn.RELEASE, PhaseTurn.STOP), repeat=2):
         after = stopped
         for turn in turns:
             after = next_phase(after, turn)
         assert after is stopped
-    assert next_phase(stopped, Turn.END) is Phase.ENDED
+    assert next_phase(stopped, PhaseTurn.END) is Phase.ENDED
 
 
 @pytest.mark.parametrize("phase", Phase)
 def test_a_run_that_takes_itself_down_is_not_aborted_any_more(phase: Phase):
-    ending = next_phase(phase, Turn.TAKE_DOWN)
+    ending = next_phase(phase, PhaseTurn.TAKE_DOWN)
     assert ending is (Phase.ENDED if phase is Phase.ENDED else Phase.ENDING)
-    assert {next_phase(ending, turn) for turn in Turn} <= {ending, Phase.ENDED}
+    assert {next_phase(ending, turn) for turn in PhaseTurn} <= {ending, Phase.ENDED}
 
 
 def test_a_run_is_held_and_released_only_between_its_start_and_its_stop():
-    assert next_phase(Phase.IDLE, Turn.HOLD) is Phase.IDLE
-    assert next_phase(Phase.IDLE, Turn.START) is Phase.RUNNING
-    assert next_phase(Phase.RUNNING, Turn.HOLD) is Phase.HELD
-    assert next_phase(Phase.HELD, Turn.RELEASE) is Phase.RUNNING
+    assert next_phase(Phase.IDLE, PhaseTurn.HOLD) is Phase.IDLE
+    assert next_phase(Phase.IDLE, PhaseTurn.START) is Phase.RUNNING
+    assert next_phase(Phase.RUNNING, PhaseTurn.HOLD) is Phase.HELD
+    assert next_phase(Phase.HELD, PhaseTurn.RELEASE) is Phase.RUNNING

@@ -15,7 +15,7 @@ from thermostand.stand.config.guard_section import HeaterOffConfig
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.plausibility import (
-    Following,
+    FollowingBody,
     measured,
     together,
     warming_while_off,
@@ -259,7 +259,7 @@ def test_air_that_rises_with_the_heater_off_was_heated_unless_something_else_can
 
 
 def test_a_granite_without_a_thermometer_is_taken_for_what_the_air_makes_of_it():
-    hub, granite = Hub(), Following(AIR, lag_s=4000.0, warmest_degC=40.0)
+    hub, granite = Hub(), FollowingBody(AIR, lag_s=4000.0, warmest_degC=40.0)
     around = together(measured(LABORATORY), granite)
     publish_all(hub, {AIR: 20.0, LABORATORY: 24.0})
     assert around(hub, 0) == (24.0, 40.0)
@@ -276,7 +276,7 @@ def test_a_granite_without_a_thermometer_is_taken_for_what_the_air_makes_of_it()
 
 def test_on_a_stand_without_the_granite_a_welded_relay_is_found_once_the_air_is_above_all_that_could_warm_it():
     hub = Hub()
-    rule = warming_while_off(HeaterOffConfig(), AIR, "regulator", PERMIT, Following(AIR, 4300.0, 40.0))
+    rule = warming_while_off(HeaterOffConfig(), AIR, "regulator", PERMIT, FollowingBody(AIR, 4300.0, 40.0))
     publish_all(hub, WELDED | {GRANITE: math.nan, LABORATORY: math.nan})
     found_s: list[int] = []
     for second in range(0, 30_000, 10):

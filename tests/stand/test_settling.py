@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from thermostand.experiments.steps import SoakUntilSettled
 from thermostand.markers.detection import Detection
 from thermostand.markers.edge_model import EdgeState
-from thermostand.stand.imaging.settling import Rate, Seen, camera_rate, digit_K, drift_rate, judge, movement
+from thermostand.stand.imaging.settling import Rate, SettlingSeen, camera_rate, digit_K, drift_rate, judge, movement
 
 SOAK = SoakUntilSettled(
     max_s=2700.0,
@@ -41,7 +41,7 @@ def looks(moved_px: NDArray[np.float64], count: int = 6) -> NDArray[Any]:
     return np.column_stack((look_times(count), moved_px, np.full(count, LOOK_PX)))
 
 
-AT_REST = Seen(chamber=polls(30.02), camera=polls(48.25), digit_K=0.25, looks=looks(np.zeros((6, 4))))
+AT_REST = SettlingSeen(chamber=polls(30.02), camera=polls(48.25), digit_K=0.25, looks=looks(np.zeros((6, 4))))
 
 
 def test_a_camera_at_rest_in_a_chamber_at_its_set_point_is_settled():

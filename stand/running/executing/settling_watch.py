@@ -19,7 +19,7 @@ from thermostand.foundation.items import Batch, Item
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.target import Target
 from thermostand.stand.estimating.chamber_model import BAND_K
-from thermostand.stand.imaging.settling import Float, Seen, digit_K, judge, movement, seconds
+from thermostand.stand.imaging.settling import Float, SettlingSeen, digit_K, judge, movement, seconds
 from thermostand.stand.stand import Stand
 
 if TYPE_CHECKING:
@@ -154,11 +154,11 @@ class SettlingWatch:
         chamber = self._readings[CHAMBER]
         return bool(chamber) and abs(chamber[-1] - chamber_degC) <= BAND_K
 
-    def _seen(self) -> Seen:
+    def _seen(self) -> SettlingSeen:
         chamber, camera = (np.array(self._readings[name]).reshape(-1, 2).T for name in (CHAMBER, CAMERA))
         # A camera at rest shows one digit only; how wide that is shows while it moves.
         self._digit_K = min(filter(None, (self._digit_K, digit_K(camera[1]))), default=0.0)
-        return Seen(chamber, camera, self._digit_K, np.array(self._looks, np.float64).reshape(-1, 6))
+        return SettlingSeen(chamber, camera, self._digit_K, np.array(self._looks, np.float64).reshape(-1, 6))
 
 
 def _is_passing(reading: Reading, kept: array[float]) -> bool:

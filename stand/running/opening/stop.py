@@ -9,7 +9,7 @@ from collections.abc import Callable
 from thermostand.foundation.errors import Interrupted, SessionError, StandTripped
 from thermostand.foundation.patience import Patience
 from thermostand.stand.fault import Fault
-from thermostand.stand.gate import STOPPING, Gate, Phase, Turn, next_phase
+from thermostand.stand.gate import STOPPING, Gate, Phase, PhaseTurn, next_phase
 from thermostand.stand.stand import Stand
 
 STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
@@ -51,7 +51,7 @@ class Stop:
 
     def started(self) -> None:
         """The plan begins."""
-        self._turn(Turn.START)
+        self._turn(PhaseTurn.START)
         if self._stand is not None:
             self._follow(self._stand.gate)
 
@@ -75,7 +75,7 @@ class Stop:
             if self.phase is Phase.ENDED:
                 self.patience.begin()
             return False
-        self._turn(Turn.STOP)
+        self._turn(PhaseTurn.STOP)
         if self._stand is None:
             self._run.cancel()
         else:
@@ -84,17 +84,17 @@ class Stop:
 
     def taking_down(self) -> None:
         """From here on the run makes safe and cleans up by itself and must not be cancelled."""
-        self._turn(Turn.TAKE_DOWN)
+        self._turn(PhaseTurn.TAKE_DOWN)
 
     async def settled(self) -> None:
         """From here on nothing is cancelled: the clock and the wires may go."""
-        self._turn(Turn.TAKE_DOWN)
+        self._turn(PhaseTurn.TAKE_DOWN)
         if self._aborting is not None:
             await asyncio.wait([self._aborting])
 
     def ended(self) -> None:
         """The plan has ended, whichever way, and the stand is safe."""
-        self._turn(Turn.END)
+        self._turn(PhaseTurn.END)
         if self.reason is not None:
             self.patience.begin()
 
@@ -103,13 +103,13 @@ class Stop:
             await stand.safety.tried()
         finally:
             if self.phase is Phase.ABORTING:
-                self._turn(Turn.TAKE_DOWN)
+                self._turn(PhaseTurn.TAKE_DOWN)
                 self._run.cancel()
 
     def _follow(self, gate: Gate) -> None:
-        self._turn(Turn.HOLD if gate.reasons else Turn.RELEASE)
+        self._turn(PhaseTurn.HOLD if gate.reasons else PhaseTurn.RELEASE)
 
-    def _turn(self, turn: Turn) -> None:
+    def _turn(self, turn: PhaseTurn) -> None:
         self.phase = next_phase(self.phase, turn)
 
     async def __aenter__(self) -> Stop:
