@@ -15,8 +15,7 @@ from thermostand.foundation.clock import Clock, boot_of, seconds_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied
 from thermostand.foundation.events import NO_DEAD_MAN, REGULATOR_OCCUPIED
 from thermostand.foundation.hub import Hub
-from thermostand.stand.chamber.compressor import restored
-from thermostand.stand.chamber.compressor_file import CompressorFile
+from thermostand.stand.chamber.compressor import CompressorFile, restored
 from thermostand.stand.chamber.keeper import Keeper
 from thermostand.stand.chamber.permits import PermitLimits, Permits
 from thermostand.stand.interlock import Interlock

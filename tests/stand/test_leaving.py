@@ -17,8 +17,7 @@ from thermostand.foundation.items import Event
 from thermostand.foundation.patience import BUDGET_S, LEAST_S, Patience
 from thermostand.recording.writing.disk import FILES_LINE, QUEUE_LINE, Disk, DiskCalls
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
-from thermostand.stand.chamber.compressor import CompressorState
-from thermostand.stand.chamber.compressor_file import CompressorFile
+from thermostand.stand.chamber.compressor import CompressorFile, CompressorState
 from thermostand.stand.daemon.daemon_file import Kept, KeptFile
 from thermostand.stand.queueing.queue import append
 from thermostand.stand.queueing.queue_file import Entry
