@@ -547,7 +547,8 @@ class _Look:
                 if name not in told and text_hash(self._texts.get(name)) != known:
                     told.add(name)
                     yield _error(f"{name} is not attached as the run began with it, by {where}")
-        for name in sorted(self._texts.keys() - (stated[MANIFEST_NAME] or self._texts).keys()):
+        listed = stated[MANIFEST_NAME]
+        for name in sorted(self._texts.keys() - (self._texts if listed is None else listed).keys()):
             yield _error(f"{name} is attached, and was not when the run began, by {MANIFEST_NAME}")
 
     def _manifest_findings(self) -> Iterator[Finding]:

@@ -1,19 +1,23 @@
 """Damage that a list, a verification or a fit might take for a sound session."""
 
+import asyncio
+import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from tests.recording.recorded import INFO
-from tests.recording.runs import SECONDS, entries, record_run, second, write_journal
-from tests.stand.hostile_sessions import everywhere, rewritten
+from tests.recording.runs import SECONDS, entries, record_run, remove, second, write_journal
+from tests.stand.hostile_sessions import event, everywhere, rewritten
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark
 from thermostand.foundation.readings import Frame
-from thermostand.recording.format.journal_lines import text_hash
+from thermostand.recording.format.journal_lines import JOURNAL_NAME, text_hash
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
-from thermostand.recording.format.manifest import SessionInfo
+from thermostand.recording.format.manifest import MANIFEST_NAME, Sealed, SessionInfo, journal_so_far, read_manifest
+from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.run_word import Files
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session, open_whole
@@ -107,3 +111,208 @@ def test_what_a_session_is_alone_goes_with_its_copies():
     info = replace(INFO, uid="00ff")
     assert SessionInfo.of(info.metadata()) == info
     assert "uid" not in INFO.metadata()
+
+
+@pytest.fixture(scope="module")
+def ended_nights(tmp_path_factory):
+    """Two complete runs of one second and recipe, whose manifests have their journals; not to be changed."""
+    nights = tmp_path_factory.mktemp("nights")
+    for name, uid in (("night-1", "00ff"), ("night-2", "11ee")):
+        directory = asyncio.run(record_run(nights / name))
+        everywhere(directory, uid=uid)
+        end(directory)
+    return nights
+
+
+def end(directory, **changes):
+    """The manifest as it is written last, with the journal as it is now."""
+    stated = replace(read_manifest(directory), **changes)
+    data = (directory / JOURNAL_NAME).read_bytes()
+    ended = replace(stated, plan={"steps": SECONDS, "frames": SECONDS}, ended=True, journal=journal_so_far(data))
+    (directory / MANIFEST_NAME).write_bytes(ended.encoded())
+
+
+@pytest.fixture
+def night(ended_nights, tmp_path):
+    """The first of them; `night.parent / "night-2"` is the other."""
+    return Path(shutil.copytree(ended_nights, tmp_path / "nights")) / "night-1"
+
+
+def journal_lines_of(directory):
+    return (directory / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+
+
+def rewrite_journal(directory, lines):
+    (directory / JOURNAL_NAME).write_bytes(b"".join(lines))
+
+
+def swap_with(directory, name):
+    """The segments of that name of both sessions, exchanged."""
+    one, other = directory / name, directory.parent / "night-2" / name
+    mine = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(mine)
+
+
+def edit_manifest(directory, old, new):
+    path = directory / MANIFEST_NAME
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def remake_manifest(directory, **changes):
+    (directory / MANIFEST_NAME).write_bytes(replace(read_manifest(directory), **changes).encoded())
+
+
+def without(stated, *names):
+    return {name: each for name, each in stated.segments.items() if name not in names}
+
+
+def rewrite_without_topic(directory, topic):
+    """Nothing of that topic is left in any segment, and whoever did it forgot the manifest."""
+    for path in sorted((directory / TELEMETRY).glob("*.mcap")):
+        rewritten(path, relist=False, without=topic)
+
+
+def empty_segment(directory):
+    (directory / TELEMETRY / "0006.mcap").write_bytes(b"")
+
+
+# What was done, the word it makes, the file that it is said of, and whether a list, which reads both ends of each file,
+# says the same.
+CASES = {
+    "the last segment of the frames removed": (
+        lambda s: remove(s, FRAMES, 4), Files.INCOMPLETE, "frames/0004.mcap", True
+    ),
+    "the last segment of the telemetry removed": (
+        lambda s: remove(s, TELEMETRY, 5), Files.INCOMPLETE, "telemetry/0005.mcap", True
+    ),
+    "a segment in the middle removed": (
+        lambda s: remove(s, FRAMES, 2), Files.INCOMPLETE, "frames/0002.mcap", True
+    ),
+    "segments of two sessions exchanged": (
+        lambda s: swap_with(s, "frames/0002.mcap"), Files.DAMAGED, "frames/0002.mcap", True
+    ),
+    "a segment rewritten with another event": (
+        lambda s: rewritten(s / TELEMETRY / "0001.mcap", relist=False, behind=[event("note", "all is well", "")]),
+        Files.DAMAGED, "telemetry/0001.mcap", True,
+    ),
+    "an empty segment behind the last": (empty_segment, Files.DAMAGED, "telemetry/0006.mcap", True),
+    "the channel of a device taken out": (
+        lambda s: rewrite_without_topic(s, "/chamber/state"), Files.DAMAGED, "telemetry/0000.mcap", True
+    ),
+    "the journal's last lines cut off": (
+        lambda s: rewrite_journal(s, journal_lines_of(s)[:-2]), Files.INCOMPLETE, JOURNAL_NAME, True
+    ),
+    "the journal's first lines cut off": (
+        lambda s: rewrite_journal(s, journal_lines_of(s)[2:]), Files.DAMAGED, JOURNAL_NAME, True
+    ),
+    "a line of the journal edited": (
+        lambda s: rewrite_journal(s, [line.replace(b"done", b"gone") for line in journal_lines_of(s)]),
+        Files.DAMAGED, JOURNAL_NAME, True,
+    ),
+    "the journal written anew with other steps": (
+        lambda s: write_journal(s, *({**each, "step_id": "x"} for each in entries())),
+        Files.DAMAGED, JOURNAL_NAME, True,
+    ),
+    "the journal removed": (lambda s: (s / JOURNAL_NAME).unlink(), Files.INCOMPLETE, JOURNAL_NAME, True),
+    "the manifest removed": (lambda s: (s / MANIFEST_NAME).unlink(), Files.INCOMPLETE, MANIFEST_NAME, True),
+    "the manifest empty": (lambda s: (s / MANIFEST_NAME).write_bytes(b""), Files.DAMAGED, MANIFEST_NAME, True),
+    "the manifest of another session": (
+        lambda s: shutil.copy(s.parent / "night-2" / MANIFEST_NAME, s), Files.DAMAGED, MANIFEST_NAME, True
+    ),
+    "the manifest edited": (
+        lambda s: edit_manifest(s, '"frames": 20', '"frames": 19'), Files.DAMAGED, MANIFEST_NAME, True
+    ),
+    "the manifest of a newer format": (
+        lambda s: edit_manifest(s, '"format": 3', '"format": 4'), Files.UNKNOWN, MANIFEST_NAME, True
+    ),
+    "a folder for a manifest": (
+        lambda s: ((s / MANIFEST_NAME).unlink(), (s / MANIFEST_NAME).mkdir()), Files.DAMAGED, MANIFEST_NAME, True
+    ),
+    "a manifest of wrong types, with the right checksum": (
+        lambda s: remake_manifest(s, segments={"frames/0000.mcap": Sealed("x", 7, {})}),
+        Files.DAMAGED, MANIFEST_NAME, True,
+    ),
+    "a segment that the manifest does not list": (
+        lambda s: remake_manifest(s, segments=without(read_manifest(s), "frames/0002.mcap")),
+        Files.DAMAGED, "frames/0002.mcap", True,
+    ),
+    "a text that the manifest does not list": (
+        lambda s: remake_manifest(s, texts={}), Files.DAMAGED, "", True
+    ),
+    "a text removed that the manifest lists": (
+        lambda s: remake_manifest(s, texts={**read_manifest(s).texts, "recipe.yaml": text_hash("a: 1")}),
+        Files.DAMAGED, "", True,
+    ),
+    "a bit flipped where no CRC is": (
+        lambda s: flip_library(s / FRAMES / "0001.mcap"), Files.DAMAGED, "frames/0001.mcap", False
+    ),
+}  # fmt: skip
+
+
+def named(found):
+    """The files that findings are about."""
+    return [finding.where for finding in found.findings if finding.where]
+
+
+def flip_library(path):
+    """The name of the writer's library in the header, which nothing reads."""
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"mcap-python", b"mcap-pythoN", 1))
+
+
+@pytest.mark.parametrize(("change", "files", "where", "is_listed"), CASES.values(), ids=CASES)
+def test_each_case_has_its_word_and_its_sentence_in_all_that_reads(night, change, files, where, is_listed):
+    assert words(night) is Files.SOUND
+    change(night)
+    found = verify(night)
+    assert (found.files, found.is_sound) == (files, False)
+    assert where in [finding.where for finding in found.findings if finding.files is files]
+    if is_listed:
+        listed = scan(night)
+        assert listed.files is files
+        assert overview(night).scanned.files is files
+        assert where in [finding.where for finding in listed.findings if finding.files is files]
+    if where != JOURNAL_NAME and is_listed:  # no export and no fit reads the journal
+        with pytest.raises(SessionError):
+            open_whole(night)
+
+
+@pytest.mark.parametrize("case", ["the manifest removed", "the manifest empty", "the manifest of another session"])
+def test_a_salvage_makes_a_manifest_of_what_is_there_and_it_says_so(night, case):
+    CASES[case][0](night)
+    salvage_session(night)
+    found = verify(night)
+    if case == "the manifest of another session":  # it may be the segments that are another's
+        assert found.files is Files.DAMAGED
+        return
+    assert found.files is Files.SOUND
+    assert named(found) == [MANIFEST_NAME]
+    assert open_whole(night).frame_count == SECONDS
+
+
+def test_a_segment_that_its_recorder_did_not_come_to_list_is_a_note_until_it_is_listed(night):
+    remake_manifest(night, segments=without(read_manifest(night), "frames/0004.mcap"), ended=False, journal=None)
+    found = verify(night)
+    assert found.files is scan(night).files is Files.SOUND
+    assert named(found) == ["frames/0004.mcap"]
+    assert salvage_session(night) == []
+    assert named(verify(night)) == []
+
+
+async def test_a_device_that_was_declared_and_never_read_is_a_note(tmp_path):
+    found = verify(await record_run(tmp_path / "s", items=without_regulator))
+    assert found.files is Files.SOUND
+    assert "regulator" in [finding.text.partition(":")[0] for finding in found.findings]
+
+
+def without_regulator(time_ns, index):
+    return (item for item in second(time_ns, index) if getattr(item, "device", "") != "regulator")
+
+
+def test_the_same_seed_gives_the_same_manifest(tmp_path):
+    made = [asyncio.run(record_run(tmp_path / name / "night-1")) / MANIFEST_NAME for name in "ab"]
+    assert made[0].read_bytes() == made[1].read_bytes()
+    assert json.loads(made[0].read_bytes())["plan"] == {"steps": SECONDS, "frames": SECONDS}

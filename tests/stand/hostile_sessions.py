@@ -138,10 +138,11 @@ def rewritten(
     behind=(),
     instead=None,
     relist: bool = True,
+    without: str = "",
     **session: str,
 ) -> None:
     """The segment with other attachments, metadata, messages behind its own ((topic, data), ...), or images instead.
-    relist: whoever does that makes a manifest of it as well."""
+    relist: whoever does that makes a manifest of it as well. without: a topic of which no message stays."""
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -169,6 +170,8 @@ def rewritten(
             for _, c in sorted(summary.channels.items())
         }
         for topic, message in found:
+            if topic == without:
+                continue
             data = instead(message.data) if instead and topic.endswith("/image") else message.data
             writer.add_message(channels[topic], message.log_time, data, message.publish_time, message.sequence)
             if is_frames and topic.endswith("/image"):
