@@ -45,7 +45,7 @@ from thermostand.foundation.repeats import RepeatLimit
 from thermostand.foundation.tasks import cancelled, cause_of, failure_text
 from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
-from thermostand.recording.writing.disk import REPAIR_LINE, Disk, DiskCalls
+from thermostand.recording.writing.disk import REPAIR_LINE, DiskCalls, DiskProcess
 from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.safe_ranges import accepted_text
@@ -318,7 +318,7 @@ async def run_in(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
         await _announce(job, open_stand.assembly, open_stand.disk, has_own=True)
         directory = _directory(job, open_stand.assembly.clock)
         async with _telling_failure(open_stand.assembly, directory, stop), AsyncExitStack() as stack:
-            disk = Disk()
+            disk = DiskProcess()
             stack.push_async_callback(disk.ended_within, stop.patience)
             stack.callback(open_stand.unrecorded)
             stack.push_async_callback(stop.settled)
@@ -403,7 +403,7 @@ def _directory(job: Job, clock: Clock) -> Path:
     return job.before.directory if job.before is not None else session_directory(job.out, job.order, clock)
 
 
-async def _announce(job: Job, assembly: Assembly, disk: Disk | None = None, *, has_own: bool = False) -> None:
+async def _announce(job: Job, assembly: Assembly, disk: DiskProcess | None = None, *, has_own: bool = False) -> None:
     """What the session has to say before anything moves; what earlier runs that were killed have left is completed.
     has_own: what is being recorded now is the stand's own record, which need not be announced."""
     hub, clock = assembly.hub, assembly.clock
@@ -419,7 +419,7 @@ async def _announce(job: Job, assembly: Assembly, disk: Disk | None = None, *, h
         hub.publish(STAND_DIFFERS.at(clock.now_ns(), str(difference), **difference.data()))
 
 
-async def _salvaged(job: Job, clock: Clock, disk: Disk | None) -> tuple[Salvaged, ...]:
+async def _salvaged(job: Job, clock: Clock, disk: DiskProcess | None) -> tuple[Salvaged, ...]:
     """What earlier runs that were killed have left unfinished, finished before anything moves; where a stand is open,
     by the process that touches its disk."""
     if job.before is not None:
@@ -454,7 +454,7 @@ async def _stay(
     open_stand: OpenStand,
     early: _Early,
     stop: Stop,
-    disk: Disk | None,
+    disk: DiskProcess | None,
     answer: Callable[[], Work] | None = None,
 ) -> Recorder:
     """From the camera's start to the end of the recording."""
@@ -492,7 +492,9 @@ async def _with_camera(assembly: Assembly) -> None:
         await check_temperature(camera, assembly.hub, assembly.clock)
 
 
-async def _recording(job: Job, directory: Path, assembly: Assembly, early: _Early, disk: Disk | None) -> Recorder:
+async def _recording(
+    job: Job, directory: Path, assembly: Assembly, early: _Early, disk: DiskProcess | None
+) -> Recorder:
     """The recorder, started; a disk that refuses it leaves the stand safe, as everything after this does."""
     recorder = recorder_of(job.order, directory, _info(job, directory, assembly), assembly, disk)
     await recorder.begin(early.taken)

@@ -22,17 +22,17 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import make_durable_folder, replace_file, sync_folder
 from thermostand.foundation.json_values import json_object
 from thermostand.foundation.lock_file import try_lock
-from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.format.inventory import SegmentState, inventory
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
-from thermostand.recording.reading.catalogue import DELETED, Entry, contents_of
+from thermostand.recording.reading.catalogue import DELETED, ListedSession, contents_of
 from thermostand.recording.reading.notes import NOTES_NAME, Archived, add_archived
-from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.run_word import Files, RunOutcome
 
 MANIFEST = "archive.json"
 KEEP_TAG = "keep"  # a session with this tag is never deleted
 _BLOCK_BYTES = 1 << 22
 _SPARE_BYTES = 100_000_000  # left free at the place of the copies
-_OVER = (Run.COMPLETE, Run.STOPPED, Run.TRIPPED, Run.FAILED)
+_OVER = (RunOutcome.COMPLETE, RunOutcome.STOPPED, RunOutcome.TRIPPED, RunOutcome.FAILED)
 
 Report = Callable[[int], None]
 
@@ -49,21 +49,21 @@ class Rule:
             f"back first, and do not have the tag {KEEP_TAG}"
         )
 
-    def applies(self, entry: Entry, now_ns: int) -> bool:
+    def applies(self, entry: ListedSession, now_ns: int) -> bool:
         """To this session, by what the list knows of it."""
         age_ns = 0 if entry.end_utc_ns is None else now_ns - entry.end_utc_ns
         is_old = entry.end_utc_ns is not None and age_ns >= self.after_days * 86_400e9
         return bool(is_old and entry.archived and entry.files == Files.SOUND and KEEP_TAG not in entry.tags)
 
 
-def unfit(entry: Entry) -> str:
+def unfit(entry: ListedSession) -> str:
     """Why a session is not copied now; "" when it may be."""
-    if any(state in (State.RECORDING, State.UNFINISHED) for _, state, _ in entry.segments):
+    if any(state in (SegmentState.RECORDING, SegmentState.UNFINISHED) for _, state, _ in entry.segments):
         return "is being recorded, or was never finished (`stand session salvage`)"
     return "" if entry.run in _OVER else f"its run is {entry.run} and may be resumed"
 
 
-def archive(entry: Entry, to: Path, by: str, now_ns: int, report: Report = lambda _: None) -> Path:
+def archive(entry: ListedSession, to: Path, by: str, now_ns: int, report: Report = lambda _: None) -> Path:
     """A verified copy of the session in `to`, and a line in its notes that says so; returns the copy. `report` gets the
     bytes done, of twice the session's size. Blocking. SessionError when it cannot be made; what is there is kept for
     the next try."""
@@ -104,7 +104,7 @@ def check_copy(copy: Path, contents: str, report: Report = lambda _: None) -> No
         raise SessionError(f"{copy}: cannot be read back ({error.strerror or error})") from error
 
 
-def delete(entry: Entry, report: Report = lambda _: None) -> None:
+def delete(entry: ListedSession, report: Report = lambda _: None) -> None:
     """Remove a session whose copy has just been read back. SessionError, and then nothing is removed, when the copy is
     not what it should be, or the session has changed or is in use."""
     check_copy(Path(entry.archived), entry.contents, report)
@@ -129,7 +129,7 @@ class _Locked:
             if not try_lock(self._fd):
                 self.close()
                 raise SessionError(f"{path}: a daemon has this session open; it is kept")
-        if any(file.state is State.RECORDING for file in inventory(path)):
+        if any(file.state is SegmentState.RECORDING for file in inventory(path)):
             self.close()
             raise SessionError(f"{path}: is being recorded; it is kept")
 
@@ -166,7 +166,7 @@ def _clear(part: Path, wanted: set[str]) -> None:
         path.unlink()
 
 
-def _check_room(entry: Entry, to: Path, part: Path) -> None:
+def _check_room(entry: ListedSession, to: Path, part: Path) -> None:
     there = sum(path.stat().st_size for path in part.rglob("*") if path.is_file())
     needed, free = entry.size_bytes - there + _SPARE_BYTES, shutil.disk_usage(to).free
     if needed > free:

@@ -17,7 +17,7 @@ from thermostand.foundation.files import make_durable_folder, sync_folder
 from thermostand.recording.exporting.topics import recorded_topics
 from thermostand.recording.format.images import frame_topics
 from thermostand.recording.format.layout import DEVICES, SEQUENCE_MASK, SESSION_METADATA
-from thermostand.recording.format.records import Message, telemetry_messages
+from thermostand.recording.format.records import RecordedMessage, telemetry_messages
 from thermostand.recording.reading.notes import NOTES_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import frames_topic
@@ -60,7 +60,7 @@ def export_mcap(
 def _write(
     session: Session,
     writer: Writer,
-    found: Iterator[Message],
+    found: Iterator[RecordedMessage],
     report: Callable[[float, str], None],
 ) -> None:
     writer.start(library="thermostand")
@@ -91,20 +91,20 @@ def _channel(writer: Writer, topic: Topic) -> int:
     )
 
 
-def _messages(session: Session, frames: bool, telemetry: bool) -> Iterator[Message]:
+def _messages(session: Session, frames: bool, telemetry: bool) -> Iterator[RecordedMessage]:
     """In order of time as far as each series is."""
     of_telemetry = _telemetry(session) if telemetry else iter(())
     of_frames = _frames(session) if frames else iter(())
     return heapq.merge(of_telemetry, of_frames, key=attrgetter("time_ns"))
 
 
-def _telemetry(session: Session) -> Iterator[Message]:
+def _telemetry(session: Session) -> Iterator[RecordedMessage]:
     for path in session.telemetry_segments:
         yield from telemetry_messages(path, lambda channel: True)
 
 
-def _frames(session: Session) -> Iterator[Message]:
+def _frames(session: Session) -> Iterator[RecordedMessage]:
     for image in session.images():
         topics, sequence = frame_topics(image.meta.channel), image.meta.block_id & SEQUENCE_MASK
-        yield Message(topics.meta, sequence, image.time_ns, image.description)
-        yield Message(topics.image, sequence, image.time_ns, bytes(image.data))
+        yield RecordedMessage(topics.meta, sequence, image.time_ns, image.description)
+        yield RecordedMessage(topics.image, sequence, image.time_ns, bytes(image.data))

@@ -113,7 +113,7 @@ async def replay_and_record(
         info = replace(info, holes=holes_text(session.holes))
     with new_folder(out) as folder:
         devices = recorded_devices(session)
-        recorder = Recorder(folder, info, session.attachments, devices, hub, clock, settings)
+        recorder = Recorder(folder, info, session.attachments, devices, hub, clock, settings=settings)
         recorder.start()
         background = [recorder.run()] + ([clock.run()] if isinstance(clock, VirtualClock) else [])
         try:

@@ -29,7 +29,7 @@ class Column(NamedTuple):
     type: Literal["ns", "utc", "count", "value", "word", "text"]
 
 
-class Table(Protocol):
+class TableWriter(Protocol):
     """A table being written."""
 
     def add(self, row: Sequence[Cell]) -> None:

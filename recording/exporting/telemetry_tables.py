@@ -13,11 +13,11 @@ from pathlib import Path
 
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading
-from thermostand.recording.exporting.tables import TABLES, Cell, Column, Table, TableFormat
+from thermostand.recording.exporting.tables import TABLES, Cell, Column, TableFormat, TableWriter
 from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.format import messages
 from thermostand.recording.format.kinds import Quantity
-from thermostand.recording.format.records import Message, telemetry_messages
+from thermostand.recording.format.records import RecordedMessage, telemetry_messages
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.session import Session
 
@@ -46,7 +46,7 @@ def write_telemetry(
     each segment that has been read."""
     folder.mkdir()
     quantities = _quantities(session)
-    tables: dict[str, Table] = {}
+    tables: dict[str, TableWriter] = {}
     with ExitStack() as stack:
         for path in session.telemetry_segments:
             for message in telemetry_messages(path, lambda channel: channel.topic in messages.KIND_OF_TOPIC):
@@ -116,7 +116,7 @@ def _columns(topic: str, quantities: Quantities) -> tuple[Column, ...]:
     return (*TIME_COLUMNS, Column("device", "word"), *values, Column("remarks", "text"))
 
 
-def _rows(message: Message, quantities: Quantities, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
+def _rows(message: RecordedMessage, quantities: Quantities, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
     batch = messages.decode_batch(message.topic, message.data, message.time_ns)
     yield from _batch_rows(quantities[message.topic], batch, utc)
 

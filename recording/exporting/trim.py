@@ -30,7 +30,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import frames_topic
 from thermostand.recording.writing.manifest_file import write_manifest
 from thermostand.recording.writing.recorder import RecordingSettings
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
 
 # Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
@@ -83,13 +83,13 @@ def _places(session: Session) -> Iterator[FramePlace]:
         yield from frame_places(path)
 
 
-def _telemetry(session: Session) -> Iterator[Record]:
+def _telemetry(session: Session) -> Iterator[MessageRecord]:
     for path in session.telemetry_segments:
         for message in telemetry_messages(path, lambda channel: True):
-            yield Record(message.topic, message.time_ns, message.data, message.sequence)
+            yield MessageRecord(message.topic, message.time_ns, message.data, message.sequence)
 
 
-def _kept(session: Session, begin_ns: int, end_ns: int) -> Iterator[Record]:
+def _kept(session: Session, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:
     return (record for record in _telemetry(session) if begin_ns <= record.time_ns < end_ns)
 
 
@@ -100,7 +100,7 @@ def _range(session: Session) -> str:
     return f"it goes from {session.utc.date_time(min(times_ns))} to {session.utc.local_text(max(times_ns))}"
 
 
-def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[Record]:
+def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:
     """Where the part comes from, and the mark of the step under way."""
     name, utc = session.metadata.get("session_id", session.path.name), session.utc
     text = f"trimmed from session {name}: {utc.utc_text(begin_ns)} up to {utc.utc_text(end_ns)}, the end not included"
@@ -108,12 +108,12 @@ def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Ite
     if mark is not None:
         text += f"; the mark of step {mark.step_id}, started {utc.utc_text(mark.time_ns)}, is repeated at the start"
     event = TRIMMED.at(first_ns, text)
-    yield Record(messages.EVENT, first_ns, messages.encode_event(event))
-    yield Record(messages.LOG, first_ns, messages.encode_log(event))
+    yield MessageRecord(messages.EVENT, first_ns, messages.encode_event(event))
+    yield MessageRecord(messages.LOG, first_ns, messages.encode_log(event))
     if mark is not None:
-        yield Record(messages.STEP, first_ns, messages.encode_step(mark))
+        yield MessageRecord(messages.STEP, first_ns, messages.encode_step(mark))
     if offset_ns := utc.at(first_ns):
-        yield Record(messages.EVENT, first_ns, messages.encode_event(offset_event(first_ns, offset_ns)))
+        yield MessageRecord(messages.EVENT, first_ns, messages.encode_event(offset_event(first_ns, offset_ns)))
 
 
 def _step_under_way(session: Session, begin_ns: int) -> StepMark | None:
@@ -130,7 +130,7 @@ def _step_under_way(session: Session, begin_ns: int) -> StepMark | None:
 
 
 def _write_telemetry(
-    session: Session, metadata: Mapping[str, str], folder: Path, records: Iterator[Record], first_ns: int
+    session: Session, metadata: Mapping[str, str], folder: Path, records: Iterator[MessageRecord], first_ns: int
 ) -> None:
     topics = {topic.name: topic for topic in recorded_topics(session)}
     for name in (messages.EVENT, messages.LOG, messages.STEP):
@@ -143,8 +143,8 @@ def _write_telemetry(
     _finish(series)
 
 
-def _blocks(records: Iterator[Record]) -> Iterator[list[Record]]:
-    block: list[Record] = []
+def _blocks(records: Iterator[MessageRecord]) -> Iterator[list[MessageRecord]]:
+    block: list[MessageRecord] = []
     size_bytes = 0
     for record in records:
         if block and (size_bytes >= BLOCK_BYTES or record.time_ns - block[0].time_ns >= BLOCK_NS):
@@ -167,8 +167,8 @@ def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, p
         names, stored, meta = frame_topics(place.meta.channel), read_frame(place), place.meta
         stamps = place.sequence, meta.published_ns
         records = [
-            Record(names.meta, meta.time_ns, stored.meta, *stamps),
-            Record(names.image, meta.time_ns, stored.image, *stamps),
+            MessageRecord(names.meta, meta.time_ns, stored.meta, *stamps),
+            MessageRecord(names.image, meta.time_ns, stored.image, *stamps),
         ]
         _commit(series, records, place.time_ns)
     _finish(series)
@@ -186,11 +186,20 @@ def _series(
     usual = RecordingSettings()
     segment_ns = seconds_ns(usual.segment_s)
     texts, size_bytes = session.attachments, usual.segment_bytes
-    form = SeriesForm(folder.name, topics, compression, metadata, texts, size_bytes, segment_ns, level=level)
+    form = SeriesForm(
+        name=folder.name,
+        topics=topics,
+        compression=compression,
+        session=metadata,
+        attachments=texts,
+        segment_bytes=size_bytes,
+        segment_ns=segment_ns,
+        level=level,
+    )
     return Series(folder, form)
 
 
-def _commit(series: Series, records: list[Record], now_ns: int) -> None:
+def _commit(series: Series, records: list[MessageRecord], now_ns: int) -> None:
     """Commit, or raise what a recorder would overcome: a copy that went half wrong is begun again, not mended."""
     series.commit(records, now_ns)
     if series.troubles:

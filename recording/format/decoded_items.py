@@ -13,7 +13,7 @@ from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
 from thermostand.recording.format.damage import naming
 from thermostand.recording.format.images import decode_image, windows_of
-from thermostand.recording.format.records import FramePlace, Message, read_frame
+from thermostand.recording.format.records import FramePlace, RecordedMessage, read_frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,12 @@ def recorded_image(place: FramePlace) -> RecordedImage:
     return RecordedImage(place.meta, description, image, place.path, place.chunk.length)
 
 
-def step_of(message: Message) -> StepMark:
+def step_of(message: RecordedMessage) -> StepMark:
     """The step mark in a message; SessionError when it is none."""
     return messages.decode_step(message.data, message.time_ns)
 
 
-def event_of(message: Message) -> Event:
+def event_of(message: RecordedMessage) -> Event:
     """The event in a message; SessionError when it is none."""
     return messages.decode_event(message.data, message.time_ns)
 
@@ -54,7 +54,7 @@ def stands_for_item(channel: Channel) -> bool:
     return channel.topic in {*messages.KIND_OF_TOPIC, messages.STEP, messages.EVENT, messages.ORIGINAL}
 
 
-def item_of(message: Message) -> Batch | StepMark | Event | Original:
+def item_of(message: RecordedMessage) -> Batch | StepMark | Event | Original:
     """The item that a message stands for."""
     match message.topic:
         case messages.STEP:

@@ -94,4 +94,12 @@ def _hole(entry: object) -> Hole | None:
     if series not in _WHAT or not isinstance(excused, bool) or not all(isinstance(n, _NUMBERS) for n in numbers):
         return None
     first, last, begin_ns, end_ns, frames = cast("list[int | None]", numbers)
-    return Hole(cast("str", series), first, last, begin_ns, end_ns, frames or 0, excused)
+    return Hole(
+        series=cast("str", series),
+        first=first,
+        last=last,
+        begin_ns=begin_ns,
+        end_ns=end_ns,
+        frames=frames or 0,
+        excused=excused,
+    )

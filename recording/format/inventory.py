@@ -29,7 +29,7 @@ from thermostand.recording.format.layout import (
 MOST_MISSING = 10_000  # segments; a night has hundreds
 
 
-class State(StrEnum):
+class SegmentState(StrEnum):
     """finished: indexed, read by everything. unfinished: left by a recorder that is gone. recording: a recorder has it
     open. damaged: the original of a salvaged segment, kept because not all of it could be recovered."""
 
@@ -39,7 +39,7 @@ class State(StrEnum):
     DAMAGED = "damaged"
 
 
-_STATE = {FINISHED: State.FINISHED, UNFINISHED: State.UNFINISHED, DAMAGED: State.DAMAGED}
+_STATE = {FINISHED: SegmentState.FINISHED, UNFINISHED: SegmentState.UNFINISHED, DAMAGED: SegmentState.DAMAGED}
 # A second damaged original of the same number is NNNN.2.mcap.damaged. A number has one spelling.
 _NAME = re.compile(
     rf"(\d{{4}}|[1-9]\d{{4,}})({re.escape(FINISHED)}|{re.escape(UNFINISHED)}|(?:\.\d+)?{re.escape(DAMAGED)})"
@@ -53,7 +53,7 @@ class SegmentFile:
     path: Path
     series: str
     number: int
-    state: State
+    state: SegmentState
     size_bytes: int
 
     @property
@@ -95,8 +95,8 @@ def _segment_file(path: Path) -> SegmentFile | None:
         if name is None or not path.is_file():
             return None
         state = next(state for suffix, state in _STATE.items() if path.name.endswith(suffix))
-        if state is State.UNFINISHED and is_locked(path):
-            state = State.RECORDING
+        if state is SegmentState.UNFINISHED and is_locked(path):
+            state = SegmentState.RECORDING
         return SegmentFile(path, path.parent.name, int(name[1]), state, path.stat().st_size)
     except FileNotFoundError:
         return None

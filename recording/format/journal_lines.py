@@ -22,7 +22,7 @@ LIMIT_BYTES = 32_000_000  # an entry a minute for 200 days; all of them are in m
 
 
 @dataclass(frozen=True, slots=True)
-class Lines:
+class CheckedLines:
     """sound: the JSON of each sound line. damaged: numbers of the damaged lines, from 1, and `of` how many lines there
     are. size_bytes: up to the end of the last sound line. mark: the file's, b"" when no line has one. unended_bytes:
     behind the last end of a line."""
@@ -49,7 +49,7 @@ def journal_lines(texts: Iterable[bytes], mark: bytes, place: int = 0) -> bytes:
     return bytes(found)
 
 
-def lines_of(data: bytes) -> Lines:
+def lines_of(data: bytes) -> CheckedLines:
     """What is sound of a journal, and what is not."""
     *lines, unended = data.split(b"\n")  # what has no end of line is no line
     found = [b""] * len(lines)  # of each line, mark and JSON where it fits its CRC
@@ -65,7 +65,7 @@ def lines_of(data: bytes) -> Lines:
     texts = [marked[9:] if marked[:8] == mark else b"" for marked in found]
     size_bytes = max((end for end, text in zip(ends, texts, strict=True) if text), default=0)
     damaged = tuple(number for number, text in enumerate(texts, 1) if not text)
-    return Lines(tuple(filter(None, texts)), damaged, len(lines), size_bytes, mark, len(unended))
+    return CheckedLines(tuple(filter(None, texts)), damaged, len(lines), size_bytes, mark, len(unended))
 
 
 def _crc(marked: bytes, place: int) -> bytes:
@@ -73,7 +73,7 @@ def _crc(marked: bytes, place: int) -> bytes:
     return b"%08x " % zlib.crc32(marked, place)
 
 
-def damage_text(lines: Lines) -> str:
+def damage_text(lines: CheckedLines) -> str:
     """Which lines are damaged, as the part of a sentence."""
     first = f"line {lines.damaged[0]}"
     more = f" and {len(lines.damaged) - 1} more" if len(lines.damaged) > 1 else ""
@@ -130,14 +130,14 @@ def journal_facts(directory: Path) -> JournalFacts | None:
     done = (entry.get("step_id") for entry in entries if entry.get("entry") == "Step" and entry.get("state") == "done")
     last_ns = _instant(last.get("time_ns"))
     return JournalFacts(
-        last_ns,
-        str(last.get("status")) if is_end else "",
-        last_ns if is_end else 0,
-        max((_instant(entry.get("time_ns")) for entry in entries if entry.get("entry") == "Gap"), default=0),
-        frozenset(step_id for step_id in done if isinstance(step_id, str)),
-        damage_text(lines) if lines.damaged else "",
-        unended_text(lines.unended_bytes) if lines.unended_bytes else "",
-        _texts(json_object(lines.sound[0]) if lines.sound else None),
+        last_ns=last_ns,
+        status=str(last.get("status")) if is_end else "",
+        ended_ns=last_ns if is_end else 0,
+        resumed_ns=max((_instant(entry.get("time_ns")) for entry in entries if entry.get("entry") == "Gap"), default=0),
+        done=frozenset(step_id for step_id in done if isinstance(step_id, str)),
+        damage=damage_text(lines) if lines.damaged else "",
+        unended=unended_text(lines.unended_bytes) if lines.unended_bytes else "",
+        texts=_texts(json_object(lines.sound[0]) if lines.sound else None),
     )
 
 

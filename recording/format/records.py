@@ -55,7 +55,7 @@ _MESSAGE_BYTES = _MESSAGE_START.size + _MESSAGE_REST.size  # with the record's h
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class RecordedMessage:
     """One message as it is in the file; `data` is still encoded."""
 
     topic: str
@@ -160,7 +160,7 @@ def _metadata(content: bytes) -> tuple[str, Mapping[str, str]]:
     return metadata.name, metadata.metadata
 
 
-def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
+def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[RecordedMessage]:
     """The messages of the wanted channels of a telemetry segment, in the order of the file."""
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
@@ -233,9 +233,9 @@ def _message_places(chunk: memoryview, wanted: Container[int]) -> list[tuple[int
     return found
 
 
-def _message(topic: str, chunk: memoryview, offset: int, end: int) -> Message:
+def _message(topic: str, chunk: memoryview, offset: int, end: int) -> RecordedMessage:
     sequence, time_ns, _ = _MESSAGE_REST.unpack_from(chunk, offset + _MESSAGE_START.size)
-    return Message(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]))
+    return RecordedMessage(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]))
 
 
 def frame_places(path: Path) -> list[FramePlace]:

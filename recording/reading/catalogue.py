@@ -49,7 +49,7 @@ Report = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ListedSession:
     """A session at a glance (`scan.Scan` has the meanings), with what people said of it.
 
     start_ns: begin_ns as UTC, end_utc_ns: end_ns. run, files: words of Run and Files. state_text, lacks: in words.
@@ -100,40 +100,42 @@ class Entry:
         return next((copy.to for copy in reversed(self.copies) if copy.contents == self.contents), "")
 
 
-def entry_of(seen: Scan, contents: str = "") -> Entry:
+def entry_of(seen: Scan, contents: str = "") -> ListedSession:
     """What a list shows of a session that was looked at."""
     from thermostand.recording.reading.run_word import Files
 
     said = read_notes(seen.path)
-    return Entry(
-        seen.path,
-        dict(seen.metadata),
-        tuple(seen.attachments),
-        seen.frames,
-        seen.size_bytes,
-        seen.begin_ns,
-        seen.end_ns,
-        None if seen.begin_ns is None else seen.utc.utc_ns(seen.begin_ns),
-        None if seen.end_ns is None else seen.utc.utc_ns(seen.end_ns),
-        str(seen.run),
-        str(seen.files),
-        seen.state_text,
-        seen.lacks,
-        seen.has_camera_degC,
-        json.dumps([(file.name, str(file.state), file.size_bytes) for file in seen.inventory]),
-        seen.sentences(Files.DAMAGED),
-        seen.sentences(Files.INCOMPLETE),
-        contents or contents_of(seen.path),
-        said.notes,
-        said.tags,
-        said.archived,
+    return ListedSession(
+        path=seen.path,
+        metadata=dict(seen.metadata),
+        attachments=tuple(seen.attachments),
+        frames=seen.frames,
+        size_bytes=seen.size_bytes,
+        begin_ns=seen.begin_ns,
+        end_ns=seen.end_ns,
+        start_ns=None if seen.begin_ns is None else seen.utc.utc_ns(seen.begin_ns),
+        end_utc_ns=None if seen.end_ns is None else seen.utc.utc_ns(seen.end_ns),
+        run=str(seen.run),
+        files=str(seen.files),
+        state_text=seen.state_text,
+        lacks=seen.lacks,
+        has_camera_degC=seen.has_camera_degC,
+        segments_json=json.dumps([(file.name, str(file.state), file.size_bytes) for file in seen.inventory]),
+        troubles=seen.sentences(Files.DAMAGED),
+        missing=seen.sentences(Files.INCOMPLETE),
+        contents=contents or contents_of(seen.path),
+        notes=said.notes,
+        tags=said.tags,
+        copies=said.archived,
     )
 
 
-Memory = dict[Path, tuple[str, Entry]]  # a digest of the files, and what was made of them
+Memory = dict[Path, tuple[str, ListedSession]]  # a digest of the files, and what was made of them
 
 
-def catalogue(folder: Path, report: Callable[[int], Report] | None = None, memory: Memory | None = None) -> list[Entry]:
+def catalogue(
+    folder: Path, report: Callable[[int], Report] | None = None, memory: Memory | None = None
+) -> list[ListedSession]:
     """The sessions in `folder`, the oldest first. `report`: called with how many must be looked at, gives what is
     called with the progress. memory: takes what is new in place of the index, for who must not wait for a disk that
     hangs. Blocking; OSError when the folder cannot be read."""
@@ -153,7 +155,7 @@ def catalogue(folder: Path, report: Callable[[int], Report] | None = None, memor
     return sorted(known.values(), key=lambda entry: (entry.begin_ns or 0, str(entry.path)))
 
 
-def look_at(path: Path) -> Entry:
+def look_at(path: Path) -> ListedSession:
     """The session in `path`, whatever an index says; SessionError when there is none."""
     from thermostand.recording.reading.scan import scan  # takes half a second to import
 
@@ -227,7 +229,7 @@ class _Index:
             if self._is_ours():
                 self._rows = self._read()
 
-    def get(self, path: Path, files: str) -> Entry | None:
+    def get(self, path: Path, files: str) -> ListedSession | None:
         """What was entered of these files; None when nothing was."""
         if self._memory is not None and (seen := self._memory.get(path)) is not None and seen[0] == files:
             return seen[1]
@@ -240,7 +242,7 @@ class _Index:
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
 
-    def put(self, path: Path, files: str, entry: Entry) -> None:
+    def put(self, path: Path, files: str, entry: ListedSession) -> None:
         """Enter it, with the others, at the end."""
         if self._memory is not None:
             self._memory[path] = files, entry
@@ -298,14 +300,14 @@ class _Index:
         return _digest((self._version, name, files, text))
 
 
-def _encoded(entry: Entry) -> str:
+def _encoded(entry: ListedSession) -> str:
     values = {field.name: getattr(entry, field.name) for field in fields(entry) if field.name != "path"}
     for name in ("notes", "copies"):
         values[name] = [asdict(each) for each in values[name]]
     return json.dumps(values)
 
 
-def _decoded(path: Path, text: str) -> Entry:
+def _decoded(path: Path, text: str) -> ListedSession:
     """ValueError, TypeError, KeyError or AttributeError when the text is none."""
     values = cast("dict[str, Any]", json.loads(text))
     notes = tuple(Note(**each) for each in values.pop("notes"))
@@ -315,4 +317,4 @@ def _decoded(path: Path, text: str) -> Entry:
     for name, value in values.items():
         if type(value) not in _KINDS[name]:
             raise TypeError(name)
-    return Entry(path=path, metadata=metadata, notes=notes, copies=copies, **lists, **values)
+    return ListedSession(path=path, metadata=metadata, notes=notes, copies=copies, **lists, **values)

@@ -49,7 +49,7 @@ class Archived:
 
 
 @dataclass(frozen=True, slots=True)
-class Notes:
+class SessionNotes:
     """All that was said; `tags` in the order they were given first. damage, unended: what is lost of it, and what is no
     line at its end, which was being written or is lost; "" when nothing is."""
 
@@ -64,16 +64,16 @@ class Notes:
         return asdict(self)
 
 
-def read_notes(directory: Path) -> Notes:
+def read_notes(directory: Path) -> SessionNotes:
     """Of the session in `directory`; empty when nothing was said, or none of it can be read."""
     try:
         fd = os.open(directory / NOTES_NAME, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
-        return Notes()
+        return SessionNotes()
     try:
         data = os.read(fd, LIMIT_BYTES) if stat.S_ISREG(os.fstat(fd).st_mode) else b""
     except OSError:
-        return Notes()
+        return SessionNotes()
     finally:
         os.close(fd)
     lines = lines_of(data)
@@ -151,7 +151,7 @@ def _write_whole(fd: int, data: bytes, size_bytes: int) -> None:
         raise
 
 
-def _folded(entries: Iterable[dict[str, object]]) -> Notes:
+def _folded(entries: Iterable[dict[str, object]]) -> SessionNotes:
     notes: list[Note] = []
     tags: dict[str, None] = {}
     archived: list[Archived] = []
@@ -170,7 +170,7 @@ def _folded(entries: Iterable[dict[str, object]]) -> Notes:
                 archived.append(Archived(str(entry.get("to", "")), time_ns, str(entry.get("contents", ""))))
             case _:
                 pass  # of a later version
-    return Notes(tuple(notes), tuple(tags), tuple(archived))
+    return SessionNotes(tuple(notes), tuple(tags), tuple(archived))
 
 
 def _tags(entry: dict[str, object]) -> list[str]:

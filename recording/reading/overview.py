@@ -114,7 +114,14 @@ def _steps(recorded: Recorded) -> Iterator[RunStep]:
         first, end = marks[0], marks[-1]
         end_ns = None if end.state is StepState.STARTED else end.time_ns
         yield RunStep(
-            first.index, step_id, first.kind, first.parameters, end.state, first.time_ns, end_ns, frames[step_id]
+            index=first.index,
+            step_id=step_id,
+            kind=first.kind,
+            parameters=first.parameters,
+            state=end.state,
+            begin_ns=first.time_ns,
+            end_ns=end_ns,
+            frames=frames[step_id],
         )
 
 
@@ -124,14 +131,14 @@ def _frames(found: Scan) -> FramesSummary:
     metas = recorded.metas
     times_ns = [meta.time_ns for meta in metas]
     return FramesSummary(
-        len(metas),
-        size_bytes,
-        f"{metas[0].width} x {metas[0].height} px, {metas[0].significant_bits} bit" if metas else "",
-        min(times_ns, default=None),
-        max(times_ns, default=None),
-        sum(meta.dropped for meta in metas),
-        sum(map(len, reported_blocks(recorded.events))),
-        Counter(flag for meta in metas for flag in meta.flags),
+        count=len(metas),
+        size_bytes=size_bytes,
+        pixels=f"{metas[0].width} x {metas[0].height} px, {metas[0].significant_bits} bit" if metas else "",
+        first_ns=min(times_ns, default=None),
+        last_ns=max(times_ns, default=None),
+        dropped=sum(meta.dropped for meta in metas),
+        lost_by_recorder=sum(map(len, reported_blocks(recorded.events))),
+        flagged=Counter(flag for meta in metas for flag in meta.flags),
     )
 
 

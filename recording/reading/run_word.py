@@ -15,7 +15,7 @@ from thermostand.recording.format.journal_lines import JournalFacts
 from thermostand.recording.format.utc_offsets import UtcOffsets
 
 
-class Run(StrEnum):
+class RunOutcome(StrEnum):
     """complete: the plan is done. stopped: by its operator. tripped: the guard ended it. failed: an error did.
     interrupted: killed, or without any end. running: it is being recorded now."""
 
@@ -43,22 +43,22 @@ def last_run_event(events: Iterable[Event]) -> Event | None:
     return max(marks, key=lambda event: event.time_ns, default=None)
 
 
-def run_word(events: Iterable[Event], journal: JournalFacts | None, *, is_recording: bool = False) -> Run:
+def run_word(events: Iterable[Event], journal: JournalFacts | None, *, is_recording: bool = False) -> RunOutcome:
     """By the recording or by its journal, whichever has the later entry."""
     if is_recording:
-        return Run.RUNNING
+        return RunOutcome.RUNNING
     last = last_run_event(events)
     ended_ns = -1 if last is None else last.time_ns
     if journal is not None and (journal.last_ns > ended_ns or (journal.status and journal.last_ns == ended_ns)):
         return known_word(journal.status)
     if last is None or last.kind != RUN_END:
-        return Run.INTERRUPTED
+        return RunOutcome.INTERRUPTED
     return known_word(str(last.data.get("status")))
 
 
-def known_word(status: str) -> Run:
+def known_word(status: str) -> RunOutcome:
     """The word, interrupted for what is none."""
-    return Run(status) if status in set(Run) - {Run.RUNNING} else Run.INTERRUPTED
+    return RunOutcome(status) if status in set(RunOutcome) - {RunOutcome.RUNNING} else RunOutcome.INTERRUPTED
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Extent:
     session_id: str
     begin_ns: int
     end_ns: int
-    run: Run
+    run: RunOutcome
 
     def text(self, utc: UtcOffsets) -> str:
         """As a sentence."""

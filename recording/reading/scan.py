@@ -41,7 +41,7 @@ from thermostand.recording.format.holes import Hole, holes_in, segments_text
 from thermostand.recording.format.inventory import (
     MOST_MISSING,
     SegmentFile,
-    State,
+    SegmentState,
     foreign_numbers,
     inventory,
     misplaced,
@@ -61,13 +61,13 @@ from thermostand.recording.format.layout import (
 from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, NoManifest, SessionInfo, read_manifest
 from thermostand.recording.format.mcap_bytes import Source
 from thermostand.recording.format.messages import FrameMeta, decode_frame_meta
-from thermostand.recording.format.records import Message, frame_places, read_head, telemetry_messages
+from thermostand.recording.format.records import RecordedMessage, frame_places, read_head, telemetry_messages
 from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
 from thermostand.recording.reading.gaps import lost_frames_of, reported_blocks, silences
 from thermostand.recording.reading.notes import NOTES_NAME, read_notes
-from thermostand.recording.reading.run_word import Files, Run, extent_of, last_run_event, run_word
-from thermostand.recording.reading.segment_check import Damage, check_segment
+from thermostand.recording.reading.run_word import Files, RunOutcome, extent_of, last_run_event, run_word
+from thermostand.recording.reading.segment_check import SegmentDamage, check_segment
 from thermostand.recording.reading.walk import survey
 
 Report = Callable[[float, str], None]
@@ -96,7 +96,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class SessionFinding:
     """One sentence; `where` is the file it is about, as in `telemetry/0003.mcap`, or "" for the whole session. `files`:
     what an error makes of the session's files, sound for a note."""
 
@@ -141,7 +141,7 @@ class Recorded:
     channels: dict[str, ChannelReadings] = field(default_factory=dict[str, ChannelReadings])
     metas: list[FrameMeta] = field(default_factory=list[FrameMeta])
 
-    def receive(self, message: Message) -> None:
+    def receive(self, message: RecordedMessage) -> None:
         """Keep what a message of the telemetry says; SessionError when it cannot be read."""
         match message.topic:
             case messages.EVENT:
@@ -171,7 +171,7 @@ class SegmentSeen:
     first_ns: float = inf
     last_ns: float = -inf
     sha256: str = ""
-    damages: list[Damage] = field(default_factory=list[Damage])
+    damages: list[SegmentDamage] = field(default_factory=list[SegmentDamage])
 
     @property
     def is_described(self) -> bool:
@@ -199,10 +199,10 @@ class Scan:
     bytes: int
     begin_ns: int | None
     end_ns: int | None
-    findings: tuple[Finding, ...]
+    findings: tuple[SessionFinding, ...]
     holes: tuple[Hole, ...]
     utc: UtcOffsets
-    run: Run
+    run: RunOutcome
     has_camera_degC: bool | None
     planned: int | None
     recorded: Recorded
@@ -244,7 +244,7 @@ class Scan:
         """What a fit would miss in these frames, in words; "" when there is nothing."""
         return NO_TEMPERATURE if self.has_camera_degC is False else ""
 
-    def count(self, state: State) -> int:
+    def count(self, state: SegmentState) -> int:
         """How many segments are in that state."""
         return sum(file.state is state for file in self.inventory)
 
@@ -268,8 +268,8 @@ def scan(path: Path, depth: Depth = Depth.ENDS, report: Report = _no_report) -> 
     look = _Look(path, files, depth)
     look.read(report)
     found = look.result()
-    is_quiet = found.is_sound and not any(file.state is State.RECORDING for file in files)
-    if depth is Depth.ENDS and is_quiet and (found.run is not Run.COMPLETE or look.frames_short()):
+    is_quiet = found.is_sound and not any(file.state is SegmentState.RECORDING for file in files)
+    if depth is Depth.ENDS and is_quiet and (found.run is not RunOutcome.COMPLETE or look.frames_short()):
         deeper = scan(path, Depth.STEPS, report)
         return replace(deeper, recorded=found.recorded)  # a list keeps no more in memory than it reads
     return found
@@ -298,7 +298,7 @@ class _Look:
 
     def read(self, report: Report) -> None:
         for file in self._files:
-            if file.state is State.FINISHED:
+            if file.state is SegmentState.FINISHED:
                 self._seen.append(self._every_byte(file, report) if self._depth is Depth.BYTES else self._ends(file))
         if self._depth is Depth.BYTES:
             return
@@ -340,13 +340,13 @@ class _Look:
                         self._recorded.receive(message)
 
     def _every_byte(self, file: SegmentFile, report: Report) -> SegmentSeen:
-        unreadable: list[Damage] = []
+        unreadable: list[SegmentDamage] = []
 
-        def receive(message: Message) -> None:
+        def receive(message: RecordedMessage) -> None:
             try:
                 self._recorded.receive(message)
             except SessionError as error:
-                unreadable.append(Damage(str(error), message.time_ns, message.time_ns))
+                unreadable.append(SegmentDamage(str(error), message.time_ns, message.time_ns))
 
         before_bytes = self._read_bytes
         check = check_segment(file.path, receive, lambda done_bytes: report(before_bytes + done_bytes, file.name))
@@ -355,9 +355,9 @@ class _Look:
             try:
                 self._recorded.metas.append(decode_frame_meta(description))
             except SessionError as error:
-                unreadable.append(Damage(str(error), -inf, inf))
+                unreadable.append(SegmentDamage(str(error), -inf, inf))
         strange = [name for name, text in check.texts.items() if not _is_utf_8(text)]
-        unreadable += [Damage(f"{name}, which is attached, is not UTF-8") for name in strange]
+        unreadable += [SegmentDamage(f"{name}, which is attached, is not UTF-8") for name in strange]
         return SegmentSeen(
             file,
             session=check.metadata.get(SESSION_METADATA, {}),
@@ -380,7 +380,7 @@ class _Look:
         self._journal = journal_facts(self._path)
         self._manifest = read_manifest(self._path)
         self._utc = offsets_of(self._recorded.events)
-        self._is_recording = any(file.state is State.RECORDING for file in self._files)
+        self._is_recording = any(file.state is SegmentState.RECORDING for file in self._files)
         self._lost_end = None if self._extent else self._find_lost_end()
         with_messages = [each for each in self._seen if each.messages]
         run = (
@@ -390,24 +390,24 @@ class _Look:
         )
         self._run = run
         return Scan(
-            self._path,
-            self._depth,
-            self._files,
-            dict(self._metadata),
-            dict(self._texts),
-            len(self._seen),
-            sum(each.messages for each in self._seen),
-            self._frame_count(),
-            self._read_bytes,
-            min((int(each.first_ns) for each in with_messages), default=None),
-            max((int(each.last_ns) for each in with_messages), default=None),
-            tuple(dict.fromkeys(self._findings())),
-            self._holes(),
-            self._utc,
-            run,
-            self._has_camera_degC(),
-            self._planned(),
-            self._recorded,
+            path=self._path,
+            depth=self._depth,
+            inventory=self._files,
+            metadata=dict(self._metadata),
+            attachments=dict(self._texts),
+            segments=len(self._seen),
+            messages=sum(each.messages for each in self._seen),
+            frames=self._frame_count(),
+            bytes=self._read_bytes,
+            begin_ns=min((int(each.first_ns) for each in with_messages), default=None),
+            end_ns=max((int(each.last_ns) for each in with_messages), default=None),
+            findings=tuple(dict.fromkeys(self._findings())),
+            holes=self._holes(),
+            utc=self._utc,
+            run=run,
+            has_camera_degC=self._has_camera_degC(),
+            planned=self._planned(),
+            recorded=self._recorded,
         )
 
     def _frame_count(self) -> int:
@@ -434,7 +434,7 @@ class _Look:
                     return found.session, texts
         return {}, {}
 
-    def _findings(self) -> Iterator[Finding]:
+    def _findings(self) -> Iterator[SessionFinding]:
         yield from _format(self._metadata)
         if self._extent is not None:
             yield _note(self._extent.text(self._utc))
@@ -462,26 +462,28 @@ class _Look:
                 yield _note(f"{NO_TEMPERATURE}: no drift over temperature can be fitted to them")
             yield from self._silent_devices()
 
-    def _not_finished(self) -> Iterator[Finding]:
+    def _not_finished(self) -> Iterator[SessionFinding]:
         by_name = {each.file.name: each for each in self._seen}
         for file in self._files:
             match file.state:
-                case State.UNFINISHED:
+                case SegmentState.UNFINISHED:
                     yield _missing_part("is not finished; `stand session salvage` recovers what is in it", file.name)
-                case State.DAMAGED if _is_recovered(file, by_name.get(f"{file.series}/{file.number:04d}{FINISHED}")):
+                case SegmentState.DAMAGED if _is_recovered(
+                    file, by_name.get(f"{file.series}/{file.number:04d}{FINISHED}")
+                ):
                     yield _note(
                         "a salvage recovered every message and kept the original because it was finished and damaged; "
                         "remove it when it is not needed",
                         file.name,
                     )
-                case State.DAMAGED:
+                case SegmentState.DAMAGED:
                     yield _error("is an original that a salvage kept because it could not recover all of it", file.name)
-                case State.RECORDING:
+                case SegmentState.RECORDING:
                     yield _note("is being recorded now and was not read", file.name)
-                case State.FINISHED:
+                case SegmentState.FINISHED:
                     pass
 
-    def _missing(self) -> Iterator[Finding]:
+    def _missing(self) -> Iterator[SessionFinding]:
         """Segments are numbered from 0 without a gap; a copy of a session with gaps has them in its record."""
         for series in (TELEMETRY, FRAMES):
             numbers = {file.number for file in self._files if file.series == series}
@@ -517,7 +519,7 @@ class _Look:
             found.append(Hole(series, first, last, begin_ns, end_ns))
         return found
 
-    def _misfits(self) -> Iterator[Finding]:
+    def _misfits(self) -> Iterator[SessionFinding]:
         """Every segment names the same session, and its own place in it."""
         for each in self._seen:
             file = each.file
@@ -531,7 +533,7 @@ class _Look:
                 said = ", ".join(f"{key}: {text}" for key, text in each.salvage.items())
                 yield _note(f"was salvaged ({said})", file.name)
 
-    def _changed_texts(self) -> Iterator[Finding]:
+    def _changed_texts(self) -> Iterator[SessionFinding]:
         """Every segment has the same texts attached, and they are those that the recording began with."""
         sound = [each for each in self._seen if not each.damages and dict(each.session) == dict(self._metadata)]
         for each in sound:
@@ -551,7 +553,7 @@ class _Look:
         for name in sorted(self._texts.keys() - (self._texts if listed is None else listed).keys()):
             yield _error(f"{name} is attached, and was not when the run began, by {MANIFEST_NAME}")
 
-    def _manifest_findings(self) -> Iterator[Finding]:
+    def _manifest_findings(self) -> Iterator[SessionFinding]:
         """What the recorder stated, against what is there."""
         stated = self._manifest
         if isinstance(stated, NoManifest):
@@ -561,7 +563,7 @@ class _Look:
                     f"{stated.text}: whether all segments are there is not known{remake}", MANIFEST_NAME
                 )
             elif stated.is_newer:
-                yield Finding(Severity.ERROR, MANIFEST_NAME, stated.text, Files.UNKNOWN)
+                yield SessionFinding(Severity.ERROR, MANIFEST_NAME, stated.text, Files.UNKNOWN)
             elif not stated.is_missing:
                 yield _error(f"{stated.text}{remake}", MANIFEST_NAME)
             return
@@ -576,7 +578,7 @@ class _Look:
         if self._extent is None and stated.journal is not None:
             yield from _of_journal(self._path, stated, self._journal)
 
-    def _listed(self, stated: Manifest, each: SegmentSeen) -> Finding | None:
+    def _listed(self, stated: Manifest, each: SegmentSeen) -> SessionFinding | None:
         """What `session.json` has against a finished segment that is there."""
         name, known = each.file.name, stated.segments.get(each.file.name)
         if each.damages or dict(each.session) != dict(self._metadata):
@@ -601,7 +603,7 @@ class _Look:
         numbers = {int(name.partition(".")[0]) for of, _, name in listed if of == series and name[:4].isdigit()}
         return sorted(number for number in numbers if number > max(there, default=-1))
 
-    def _journal_and_end(self) -> Iterator[Finding]:
+    def _journal_and_end(self) -> Iterator[SessionFinding]:
         """The journal by itself, and what it says that is not in the recording, nor in what is damaged of it."""
         journal = self._journal
         if journal is None and is_of_a_run(self._recorded.events, self._recorded.marks):
@@ -621,14 +623,14 @@ class _Look:
         """Whether the end of the telemetry is missing; None while something of it is unread, or damaged."""
         series = [file for file in self._files if file.series == TELEMETRY]
         seen = [each for each in self._of(TELEMETRY) if each.messages]
-        if not seen or self._is_recording or series[-1].state is State.UNFINISHED:
+        if not seen or self._is_recording or series[-1].state is SegmentState.UNFINISHED:
             return None
         if any(each.damages for each in self._seen if each.file == series[-1]):
             return None
         end_ns, last = int(max(each.last_ns for each in seen)), seen[-1]
         has_gap = any(hole.series == TELEMETRY for hole in (*self._recorded_holes, *self._gaps(TELEMETRY)))
         has_gap |= any(each.damages for each in self._of(TELEMETRY)) or any(
-            file.state is State.UNFINISHED for file in series
+            file.state is SegmentState.UNFINISHED for file in series
         )
         knows_steps = self._depth is not Depth.ENDS and not has_gap
         done = frozenset(mark.step_id for mark in self._recorded.marks if mark.state is StepState.DONE)
@@ -663,7 +665,7 @@ class _Look:
 
     def _all_frames_are_read(self) -> bool:
         """Whether no frame may be in a segment that was not read."""
-        unread = (State.UNFINISHED, State.RECORDING)
+        unread = (SegmentState.UNFINISHED, SegmentState.RECORDING)
         return not any(file.series == FRAMES and file.state in unread for file in self._files)
 
     @cached_property
@@ -678,7 +680,7 @@ class _Look:
     def _not_begun(self) -> int:
         """How many frames of the plan of a complete run are not there, of whatever step; 0 when an operator has left
         out one, or something else is missing that may have them."""
-        is_over = self._run is Run.COMPLETE and (
+        is_over = self._run is RunOutcome.COMPLETE and (
             (last := last_run_event(self._recorded.events)) is not None and last.kind == RUN_END
         )
         due, recorded = self._planned(), self._recorded
@@ -694,7 +696,7 @@ class _Look:
             most[step_id] = max(most.get(step_id, 0), count)
         return max(0, due - sum(most.values()) - sum(map(len, reported_blocks(recorded.events))))
 
-    def _steps_without_frames(self) -> Iterator[Finding]:
+    def _steps_without_frames(self) -> Iterator[SessionFinding]:
         """Every step that is done has its frames; what was not read may have them."""
         if missing := self._not_begun():
             yield _missing_part(f"{_frames(missing)} of the plan: missing, though the run is complete")
@@ -753,9 +755,9 @@ class _Look:
             with suppress(SessionError):
                 yield from (place.meta for place in frame_places(each.file.path))
 
-    def _silent_devices(self) -> Iterator[Finding]:
+    def _silent_devices(self) -> Iterator[SessionFinding]:
         """Devices that were declared and of which a complete run has no reading."""
-        if not isinstance(self._manifest, Manifest) or self._run is not Run.COMPLETE or self._extent is not None:
+        if not isinstance(self._manifest, Manifest) or self._run is not RunOutcome.COMPLETE or self._extent is not None:
             return
         heard = {name.partition(".")[0] for name in self._recorded.channels}
         for name in sorted(self._manifest.devices.keys() - heard):
@@ -784,7 +786,7 @@ class _Damaging:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
         if not isinstance(error, SessionError):
             return False
-        self._seen.damages.append(Damage(str(error).removeprefix(self._prefix)))
+        self._seen.damages.append(SegmentDamage(str(error).removeprefix(self._prefix)))
         return True
 
 
@@ -814,7 +816,15 @@ class Shortage:
     @property
     def hole(self) -> Hole:
         """As a stretch of the frames."""
-        return Hole(FRAMES, None, None, self.begin_ns - 1, self.end_ns + 1, self.missing, self.is_reported)
+        return Hole(
+            series=FRAMES,
+            first=None,
+            last=None,
+            begin_ns=self.begin_ns - 1,
+            end_ns=self.end_ns + 1,
+            frames=self.missing,
+            excused=self.is_reported,
+        )
 
 
 def find_shortages(marks: Iterable[StepMark], events: Sequence[Event], metas: Iterable[FrameMeta]) -> list[Shortage]:
@@ -909,7 +919,7 @@ def _is_recovered(kept: SegmentFile, salvaged: SegmentSeen | None) -> bool:
     return False
 
 
-def _of_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -> Iterator[Finding]:
+def _of_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -> Iterator[SessionFinding]:
     """Whether the journal has the lines that it had when the recording ended."""
     due = stated.journal
     if due is None or (journal is not None and journal.damage):
@@ -924,7 +934,7 @@ def _of_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -> I
         yield _error(f"is not as it was when the recording ended: {MANIFEST_NAME} states another hash", JOURNAL_NAME)
 
 
-def _of_notes(path: Path) -> Iterator[Finding]:
+def _of_notes(path: Path) -> Iterator[SessionFinding]:
     """What people said of the session."""
     said = read_notes(path)
     if said.damage:
@@ -933,10 +943,10 @@ def _of_notes(path: Path) -> Iterator[Finding]:
         yield _note(said.unended, NOTES_NAME)
 
 
-def _format(session: Mapping[str, str]) -> Iterator[Finding]:
+def _format(session: Mapping[str, str]) -> Iterator[SessionFinding]:
     """What another version of thermostand may have recorded is not known here."""
     if text := unknown_format(session):
-        yield Finding(Severity.ERROR, "", f"{text}: what that format adds was not checked", Files.UNKNOWN)
+        yield SessionFinding(Severity.ERROR, "", f"{text}: what that format adds was not checked", Files.UNKNOWN)
     elif unknown := sorted(session.keys() - {each.name for each in fields(SessionInfo)}):
         names = ", ".join(name[:40] for name in unknown[:6])
         yield _note(
@@ -944,7 +954,7 @@ def _format(session: Mapping[str, str]) -> Iterator[Finding]:
         )
 
 
-def _frames_lost(recorded: Recorded, utc: UtcOffsets) -> Iterator[Finding]:
+def _frames_lost(recorded: Recorded, utc: UtcOffsets) -> Iterator[SessionFinding]:
     """What the recorder, and what camera and wire lost, as recorded."""
     for event in recorded.events:
         if event.kind == FRAMES_DROPPED:
@@ -958,16 +968,16 @@ def _frames_lost(recorded: Recorded, utc: UtcOffsets) -> Iterator[Finding]:
             yield _note(f"{_frames(count)} of {steps.get(step_id, 'no step')} lost by the camera or its wire")
 
 
-def _error(text: str, where: str = "") -> Finding:
-    return Finding(Severity.ERROR, where, text, Files.DAMAGED)
+def _error(text: str, where: str = "") -> SessionFinding:
+    return SessionFinding(Severity.ERROR, where, text, Files.DAMAGED)
 
 
-def _missing_part(text: str, where: str = "") -> Finding:
-    return Finding(Severity.ERROR, where, text, Files.INCOMPLETE)
+def _missing_part(text: str, where: str = "") -> SessionFinding:
+    return SessionFinding(Severity.ERROR, where, text, Files.INCOMPLETE)
 
 
-def _note(text: str, where: str = "") -> Finding:
-    return Finding(Severity.NOTE, where, text)
+def _note(text: str, where: str = "") -> SessionFinding:
+    return SessionFinding(Severity.NOTE, where, text)
 
 
 def _frames(count: int) -> str:

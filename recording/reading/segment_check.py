@@ -51,14 +51,14 @@ from thermostand.recording.format.mcap_bytes import (
     stream,
 )
 from thermostand.recording.format.messages import frame_table
-from thermostand.recording.format.records import Message
+from thermostand.recording.format.records import RecordedMessage
 from thermostand.recording.format.summary import Summary, read_summary
 
 _DATA_END_BYTES = RECORD.size + CRC.size
 _PART_LIMIT_BYTES = RECORD_LIMIT_BYTES + (1 << 24)  # the indexes of its messages stand behind a chunk
 
 
-class Damage(NamedTuple):
+class SegmentDamage(NamedTuple):
     """What is wrong, and the log times between which messages may be lost by it, ns; none are when begin > end."""
 
     text: str
@@ -72,7 +72,7 @@ class SegmentCheck:
     `last_ns`: log time of its latest sound message. sha256: of all its bytes, "" when something is damaged."""
 
     path: Path
-    damages: list[Damage] = field(default_factory=list[Damage])
+    damages: list[SegmentDamage] = field(default_factory=list[SegmentDamage])
     metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     texts: dict[str, str] = field(default_factory=dict[str, str])
     descriptions: list[bytes] = field(default_factory=list[bytes])
@@ -82,7 +82,9 @@ class SegmentCheck:
     sha256: str = ""
 
 
-def check_segment(path: Path, receive: Callable[[Message], None], report: Callable[[int], None]) -> SegmentCheck:
+def check_segment(
+    path: Path, receive: Callable[[RecordedMessage], None], report: Callable[[int], None]
+) -> SegmentCheck:
     """Read the whole segment and hand each sound message but those of frames to `receive`; `report` gets the number of
     bytes read so far.
     Damage is not raised: it is listed, and the walk continues at the next place in the index."""
@@ -95,7 +97,7 @@ def check_segment(path: Path, receive: Callable[[Message], None], report: Callab
                 file.seek(0)
                 check.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     except DAMAGE as error:
-        check.damages.append(Damage(_sentence(error), -inf, inf))
+        check.damages.append(SegmentDamage(_sentence(error), -inf, inf))
     return check
 
 
@@ -129,20 +131,22 @@ def _indexed(summary: Summary) -> _Index:
     metadata = [MetadataIndex.read(data) for data in contents.get(Opcode.METADATA_INDEX, ())]
     (statistics,) = [Statistics.read(data) for data in contents.get(Opcode.STATISTICS, ())]
     return _Index(
-        summary.begin,
-        statistics,
-        {chunk.chunk_start_offset: chunk for chunk in chunks},
-        {attachment.offset: attachment for attachment in attachments},
-        {entry.offset: entry for entry in metadata},
-        {schema.id: schema for schema in schemas},
-        {channel.id: channel for channel in channels},
+        begin=summary.begin,
+        statistics=statistics,
+        chunks={chunk.chunk_start_offset: chunk for chunk in chunks},
+        attachments={attachment.offset: attachment for attachment in attachments},
+        metadata={entry.offset: entry for entry in metadata},
+        schemas={schema.id: schema for schema in schemas},
+        channels={channel.id: channel for channel in channels},
     )
 
 
 class _Walk:
     """The walk from the header to the index, place by place."""
 
-    def __init__(self, check: SegmentCheck, file: BinaryIO, index: _Index, receive: Callable[[Message], None]) -> None:
+    def __init__(
+        self, check: SegmentCheck, file: BinaryIO, index: _Index, receive: Callable[[RecordedMessage], None]
+    ) -> None:
         self._check = check
         self._file = file
         self._index = index
@@ -162,7 +166,7 @@ class _Walk:
         self._part(places[-1], self._index.begin, self._data_end)
         metadata = self._check.metadata
         if contradicts(metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})):
-            self._check.damages.append(Damage("the session's metadata do not fit their CRC"))
+            self._check.damages.append(SegmentDamage("the session's metadata do not fit their CRC"))
         if not self._check.damages:
             self._compare()
 
@@ -189,7 +193,7 @@ class _Walk:
         except DAMAGE as error:
             entry = self._index.chunks.get(place)
             times_ns = (entry.message_start_time, entry.message_end_time) if entry else (inf, -inf)
-            self._check.damages.append(Damage(f"{_sentence(error)} (at byte {place})", *times_ns))
+            self._check.damages.append(SegmentDamage(f"{_sentence(error)} (at byte {place})", *times_ns))
 
     def _header(self, place: int, data: bytes) -> None:
         content = data[len(MCAP0_MAGIC) + RECORD.size :]
@@ -250,7 +254,7 @@ class _Walk:
                 channel = self._index.channels[number]  # the first chunk, which has it too, may be damaged
                 schema = self._index.schemas[channel.schema_id].name
                 data_bytes = b"" if schema == IMAGE_SCHEMA else bytes(content[MESSAGE.size :])
-                message = Message(channel.topic, sequence, time_ns, data_bytes)
+                message = RecordedMessage(channel.topic, sequence, time_ns, data_bytes)
                 placed.append(_Placed(number, offset, time_ns, schema, message))
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream(content))
@@ -308,7 +312,7 @@ class _Placed(NamedTuple):
     offset: int
     time_ns: int
     schema: str
-    message: Message
+    message: RecordedMessage
 
 
 def _head_bytes(head: ChunkHead, entry: ChunkIndex) -> bytes:

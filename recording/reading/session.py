@@ -35,7 +35,7 @@ from thermostand.recording.format.decoded_items import (
     step_of,
 )
 from thermostand.recording.format.holes import Hole
-from thermostand.recording.format.inventory import State, inventory, misplaced
+from thermostand.recording.format.inventory import SegmentState, inventory, misplaced
 from thermostand.recording.format.layout import (
     DEVICES,
     FINISHED,
@@ -47,7 +47,7 @@ from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.records import (
     FramePlace,
     Head,
-    Message,
+    RecordedMessage,
     frame_places,
     read_head,
     telemetry_messages,
@@ -55,11 +55,11 @@ from thermostand.recording.format.records import (
 from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
 from thermostand.recording.reading.columns import Column, TopicColumns
 from thermostand.recording.reading.frames_table import FramesTable, frames_table
-from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import Depth, Scan, frames_of_plan, scan
 
 T = TypeVar("T")
-_UNFINISHED = (State.UNFINISHED, State.RECORDING)
+_UNFINISHED = (SegmentState.UNFINISHED, SegmentState.RECORDING)
 _MOST = 6  # holes in a sentence before the rest is only counted
 Say = Callable[[str], None]
 
@@ -75,7 +75,7 @@ class Session:
         self.path = path
         files = inventory(path)
         self.incomplete = tuple(file.path for file in files if file.state in _UNFINISHED)
-        self.damaged = tuple(file.path for file in files if file.state is State.DAMAGED)
+        self.damaged = tuple(file.path for file in files if file.state is SegmentState.DAMAGED)
         self._telemetry = telemetry
         self._frames = frames
         head = read_head(telemetry[0])
@@ -98,7 +98,7 @@ class Session:
         """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
         path = Path(path)
         files = inventory(path)
-        finished = [file for file in files if file.state is State.FINISHED]
+        finished = [file for file in files if file.state is SegmentState.FINISHED]
         telemetry, frames = ([file.path for file in finished if file.series == name] for name in (TELEMETRY, FRAMES))
         if not telemetry and not path.is_dir():
             raise NotThere(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
@@ -173,7 +173,7 @@ class Session:
             devices = channel.metadata.get(DEVICES, "").split(",")
             return channel.topic in messages.KIND_OF_TOPIC and (device is None or device in devices)
 
-        def add(message: Message) -> None:
+        def add(message: RecordedMessage) -> None:
             if message.topic not in topics:
                 topics[message.topic] = TopicColumns(message.topic)
             topics[message.topic].add(message.data, message.time_ns)
@@ -299,7 +299,7 @@ class Session:
             self._places_of[segment] = sorted(frame_places(segment), key=attrgetter("time_ns"))
         return self._places_of[segment]
 
-    def _decoded(self, wanted: Callable[[Channel], bool], decode: Callable[[Message], T]) -> Iterator[T]:
+    def _decoded(self, wanted: Callable[[Channel], bool], decode: Callable[[RecordedMessage], T]) -> Iterator[T]:
         """The telemetry of the wanted channels in the order of the files, each message decoded."""
         for path in self._telemetry:
             self._check(path)
@@ -323,7 +323,7 @@ class Session:
         return self.scanned.holes
 
     @property
-    def run(self) -> Run:
+    def run(self) -> RunOutcome:
         """How its run ended, as far as it is recorded."""
         return self.scanned.run
 
@@ -378,7 +378,7 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
     if not missing:
         return
     more = [f"{len(missing) - _MOST} more"] if len(missing) > _MOST else []
-    plan = frames_of_plan(session.scanned.planned, session.frame_count) if session.run is Run.COMPLETE else ""
+    plan = frames_of_plan(session.scanned.planned, session.frame_count) if session.run is RunOutcome.COMPLETE else ""
     sentence = f"{path}: is incomplete; missing: {'; '.join([*missing[:_MOST], *more])}{plan}"
     if incomplete is None:
         raise SessionError(f"{sentence}; use --incomplete to read the rest")
@@ -387,7 +387,7 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
 
 def _check_finished(path: Path, incomplete: Say | None) -> None:
     """Segments that a killed recorder has left are not read: a salvage finishes them."""
-    left = [file.name for file in inventory(path) if file.state is State.UNFINISHED]
+    left = [file.name for file in inventory(path) if file.state is SegmentState.UNFINISHED]
     if not left:
         return
     sentence = f"{path}: {left[0]} {'is' if len(left) == 1 else f'and {len(left) - 1} more are'} not finished and"

@@ -26,7 +26,7 @@ from mcap.writer import CompressionType
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import sync_folder
 from thermostand.recording.format.images import ZSTD_LEVEL
-from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.format.inventory import SegmentState, inventory
 from thermostand.recording.format.layout import (
     DAMAGED,
     FINISHED,
@@ -101,7 +101,7 @@ def opening_of(path: Path, own: Survey) -> Opening | None:
 def segments_of(series: Path) -> list[Path]:
     """The finished and unfinished segments in a folder; none when there is no such folder."""
     files = (file for file in inventory(series.parent) if file.series == series.name)
-    return [file.path for file in files if file.state is not State.DAMAGED and file.number <= _GREATEST]
+    return [file.path for file in files if file.state is not SegmentState.DAMAGED and file.number <= _GREATEST]
 
 
 def _siblings(path: Path) -> Iterator[_Sibling]:
@@ -239,7 +239,9 @@ def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salv
 def _manifest_of(directory: Path) -> Iterator[Salvaged]:
     """`session.json` lists what has been salvaged; reported where it had to be made anew."""
     files = inventory(directory)
-    if any(file.state is State.RECORDING for file in files) or all(file.state is State.DAMAGED for file in files):
+    if any(file.state is SegmentState.RECORDING for file in files) or all(
+        file.state is SegmentState.DAMAGED for file in files
+    ):
         return  # its recorder writes it, or there is nothing to list
     path = directory / MANIFEST_NAME
     with _refusing(path), suppress(SessionError):

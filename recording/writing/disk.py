@@ -24,7 +24,7 @@ LATCH_LINE = "latch"  # which waits for nothing else
 _LINES = (FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE, QUEUE_LINE, NOTES_LINE, REPAIR_LINE, LATCH_LINE)
 
 
-class Disk(Helper):
+class DiskProcess(Helper):
     """The process, with a line for each file that may hang by itself."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class DiskCalls:
     """Calls in that process, one after the other on one of its lines, waited for in a thread: who waits may leave at
     once. Without a process, as in virtual time, they are made here."""
 
-    def __init__(self, disk: Disk | None, line: str, clock: Clock) -> None:
+    def __init__(self, disk: DiskProcess | None, line: str, clock: Clock) -> None:
         self._line = None if disk is None else disk.line(line)
         self._lane = Lane(f"disk-{line}", clock, patient=False)
 

@@ -39,13 +39,13 @@ class SessionForm:
         """Of the frames: raw ones are chosen for speed."""
         settings = self.settings
         return SeriesForm(
-            FRAMES,
-            frames_topics(self.devices),
-            CompressionType.NONE if settings.frame_encoding == "raw" else CompressionType.ZSTD,
-            self.metadata,
-            self.attachments,
-            settings.segment_bytes,
-            seconds_ns(settings.segment_s),
+            name=FRAMES,
+            topics=frames_topics(self.devices),
+            compression=CompressionType.NONE if settings.frame_encoding == "raw" else CompressionType.ZSTD,
+            session=self.metadata,
+            attachments=self.attachments,
+            segment_bytes=settings.segment_bytes,
+            segment_ns=seconds_ns(settings.segment_s),
             reserve_bytes=settings.segment_bytes,
             keep_free_bytes=settings.stop_frames_below_bytes,
             topic_of=frames_topic,
@@ -55,13 +55,13 @@ class SessionForm:
     def telemetry(self) -> SeriesForm:
         """Of the telemetry: many small commits, merged when a segment is full."""
         return SeriesForm(
-            TELEMETRY,
-            telemetry_topics(self.devices),
-            CompressionType.ZSTD,
-            self.metadata,
-            self.attachments,
-            self.settings.segment_bytes,
-            seconds_ns(self.settings.segment_s),
+            name=TELEMETRY,
+            topics=telemetry_topics(self.devices),
+            compression=CompressionType.ZSTD,
+            session=self.metadata,
+            attachments=self.attachments,
+            segment_bytes=self.settings.segment_bytes,
+            segment_ns=seconds_ns(self.settings.segment_s),
             reserve_bytes=TELEMETRY_RESERVE_BYTES,
             merge_chunks=True,
         )

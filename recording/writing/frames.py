@@ -27,24 +27,24 @@ from thermostand.recording.format.layout import FRAMES, SEQUENCE_MASK
 from thermostand.recording.format.messages import decode_frame_meta
 from thermostand.recording.format.restarts import restarted_step
 from thermostand.recording.writing.home import FolderLost
-from thermostand.recording.writing.homes import Homes, Kept
+from thermostand.recording.writing.homes import FolderContents, Homes
 from thermostand.recording.writing.notices import Losses
 from thermostand.recording.writing.recorder_settings import RecordingSettings
-from thermostand.recording.writing.segment import Record
+from thermostand.recording.writing.segment import MessageRecord
 from thermostand.recording.writing.series import DiskSeries
 from thermostand.recording.writing.waiting import Waiting
 
 _OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
 
 
-class Published(NamedTuple):
+class PublishedFrame(NamedTuple):
     """A frame, and what was known then."""
 
     frame: Frame
     known: Circumstances
 
 
-def frame_records(published: Published) -> list[Record]:
+def frame_records(published: PublishedFrame) -> list[MessageRecord]:
     """The two messages of a frame; one that was recorded before keeps its description. ValueError when its image is
     none, or a window is not within it."""
     frame, published_ns = published.frame, published.known.published_ns
@@ -54,12 +54,12 @@ def frame_records(published: Published) -> list[Record]:
     meta, image = frame_topics(frame.channel)
     stamps = frame.block_id & SEQUENCE_MASK, published_ns
     return [
-        Record(meta, frame.time_ns, description, *stamps),
-        Record(image, frame.time_ns, encode_image(frame), *stamps),
+        MessageRecord(meta, frame.time_ns, description, *stamps),
+        MessageRecord(image, frame.time_ns, encode_image(frame), *stamps),
     ]
 
 
-class Surroundings:
+class StandSnapshot:
     """What is known of the stand when a frame is published: its step, and its last temperatures and positions."""
 
     def __init__(self) -> None:
@@ -100,11 +100,11 @@ class Frames:
         homes: Homes,
     ) -> None:
         self._prepare = prepare or _as_it_is
-        self._surroundings = Surroundings()
+        self._surroundings = StandSnapshot()
         self._clock = clock
         self._waiting = waiting
         self._homes = homes
-        self._queue: asyncio.Queue[Published] = asyncio.Queue(settings.queue_frames)
+        self._queue: asyncio.Queue[PublishedFrame] = asyncio.Queue(settings.queue_frames)
         self._taking = False
         self.losses = Losses()
         self.taken = 0
@@ -114,7 +114,7 @@ class Frames:
         self.series = series
         self.lane = Lane("record-frames", self._clock, patient=False)
         self._writer = FrameWriter(series, self._prepare, self.losses)
-        self.kept = Kept(self._clock.now_ns(), 0)
+        self.kept = FolderContents(self._clock.now_ns(), 0)
         self._taking = True
 
     @property
@@ -142,7 +142,7 @@ class Frames:
         if isinstance(item, Frame):
             now_ns = self._clock.now_ns()
             try:
-                self._queue.put_nowait(Published(item, self._surroundings.of(item, now_ns)))
+                self._queue.put_nowait(PublishedFrame(item, self._surroundings.of(item, now_ns)))
             except asyncio.QueueFull:
                 self.losses.count(item, "the disk did not take them in time")
                 self._waiting.frame_refused(now_ns)
@@ -164,7 +164,7 @@ class Frames:
                 self._waiting.frame_refused(published_ns)
             elif fate is Fate.SAVED:
                 self._waiting.frames_work()
-                self.kept = Kept(published_ns, self._writer.saved)
+                self.kept = FolderContents(published_ns, self._writer.saved)
             self._waiting.changed()
 
     async def tend(self, now_ns: int) -> None:
@@ -210,11 +210,11 @@ class FrameWriter:
         self._prepare = prepare
         self._losses = losses
         self._block_bytes = 0  # of the last frame that was offered to the disk
-        self.homeless: Published | None = None  # found its folder gone; it is the first to be saved again
+        self.homeless: PublishedFrame | None = None  # found its folder gone; it is the first to be saved again
         self.saved = 0
         self.done = 0
 
-    def save(self, published: Published) -> tuple[Fate, str]:
+    def save(self, published: PublishedFrame) -> tuple[Fate, str]:
         """The frame on the disk; or why it is not, and it is counted as lost: the disk refuses it twice, it is nearly
         full, or the frame cannot be encoded. One whose folder is gone is not lost."""
         fate, reason = self._fate(published)
@@ -228,13 +228,13 @@ class FrameWriter:
         self.done += 1
         return fate, reason
 
-    def give_up(self, published: Published, reason: str) -> None:
+    def give_up(self, published: PublishedFrame, reason: str) -> None:
         """A frame that found no folder to the end."""
         self.homeless = None
         self._losses.count(published.frame, reason)
         self.done += 1
 
-    def _fate(self, published: Published) -> tuple[Fate, str]:
+    def _fate(self, published: PublishedFrame) -> tuple[Fate, str]:
         frame = published.frame
         try:
             self._series.finish_full(frame.time_ns)

@@ -15,7 +15,7 @@ from thermostand.recording.writing.home import FolderLost
 Refound = Callable[[], Awaitable[bool]]
 
 
-class Kept(NamedTuple):
+class FolderContents(NamedTuple):
     """What a folder holds of this run: up to which instant, and how many frames or messages."""
 
     until_ns: int
@@ -47,7 +47,7 @@ class Homes:
         self._directory = directory
         self._tell = tell
         self._lost: dict[str, str] = {}
-        self._kept: dict[str, Kept] = {}  # by what was lost
+        self._kept: dict[str, FolderContents] = {}  # by what was lost
         self._made_again: list[str] = []  # made again by a refounding that has not come to its end
         self._reason = ""
         self.beside: list[Beside] = []
@@ -65,7 +65,7 @@ class Homes:
     def _first(self) -> str:
         return next((reason for reason in (*self._lost.values(), *(each.lost for each in self.beside)) if reason), "")
 
-    def follow(self, name: str, failure: OSError | str | None, kept: Kept) -> None:
+    def follow(self, name: str, failure: OSError | str | None, kept: FolderContents) -> None:
         """How the last look at one folder ended: only a FolderLost, or its sentence, is a loss; None ends it."""
         was = self._first()
         if isinstance(failure, FolderLost):

@@ -17,7 +17,7 @@ from threading import Lock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import replace_file
 from thermostand.recording.format.damage import reading
-from thermostand.recording.format.inventory import SegmentFile, State, inventory
+from thermostand.recording.format.inventory import SegmentFile, SegmentState, inventory
 from thermostand.recording.format.journal_lines import JOURNAL_NAME, text_hash
 from thermostand.recording.format.layout import UNFINISHED
 from thermostand.recording.format.manifest import (
@@ -123,7 +123,7 @@ def write_manifest(directory: Path, *, remade: bool = False) -> None:
 
 
 def _finished(directory: Path) -> list[SegmentFile]:
-    return [file for file in inventory(directory) if file.state is State.FINISHED]
+    return [file for file in inventory(directory) if file.state is SegmentState.FINISHED]
 
 
 def _with_segments(directory: Path, manifest: Manifest) -> Manifest:

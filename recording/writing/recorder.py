@@ -27,7 +27,7 @@ from thermostand.foundation.items import Event, Item
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.manifest import SessionInfo
-from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.forms import SessionForm
 from thermostand.recording.writing.frames import Frames
 from thermostand.recording.writing.homes import Beside, Homes
@@ -64,9 +64,10 @@ class Recorder:
         devices: Mapping[str, str],
         hub: Hub,
         clock: Clock,
+        *,
         settings: RecordingSettings = USUAL,
         prepare: Callable[[Frame], Frame] | None = None,
-        disk: Disk | None = None,
+        disk: DiskProcess | None = None,
     ) -> None:
         self.directory = directory
         self.disk = disk
@@ -79,7 +80,9 @@ class Recorder:
         tell = self._notices.append
         self._homes = Homes(directory, tell)
         self._frames = Frames(settings, prepare, clock, self._waiting, self._homes)
-        self._telemetry = Telemetry(directory, devices, settings, clock, self._waiting, self._homes, tell)
+        self._telemetry = Telemetry(
+            directory, devices, settings=settings, clock=clock, waiting=self._waiting, homes=self._homes, tell=tell
+        )
         self._receivers = self._frames.receive, self._telemetry.receive, self._receive_plan
         self._plan: dict[str, int] = {}  # that the manifest does not have yet
         self._finishing: asyncio.Future[None] | None = None

@@ -65,7 +65,7 @@ _libc.fallocate64.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes
 _libc.sync_file_range.argtypes = (ctypes.c_int, ctypes.c_int64, ctypes.c_int64, ctypes.c_uint)
 
 
-class Record(NamedTuple):
+class MessageRecord(NamedTuple):
     """One encoded message; time_ns is its log time, and its publish time unless that is given."""
 
     topic: str
@@ -244,7 +244,7 @@ class Segment:
             raise KeyError(name)
         return self._register(self._form.topic_of(name))
 
-    def commit(self, records: Iterable[Record]) -> None:
+    def commit(self, records: Iterable[MessageRecord]) -> None:
         """All of `records` on the disk when this returns."""
         for record in records:
             time_ns, published_ns = record.time_ns, record.published_ns or record.time_ns

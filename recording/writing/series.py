@@ -16,12 +16,12 @@ from thermostand.foundation.items import Event
 from thermostand.recording.format.inventory import foreign_numbers
 from thermostand.recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
 from thermostand.recording.format.manifest import Sealed
-from thermostand.recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, Disk
+from thermostand.recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, DiskProcess
 from thermostand.recording.writing.forms import SessionForm
 from thermostand.recording.writing.home import Home
 from thermostand.recording.writing.manifest_file import ManifestFile
 from thermostand.recording.writing.notices import SpaceWatch
-from thermostand.recording.writing.segment import CommitSink, Record, Segment, SeriesForm
+from thermostand.recording.writing.segment import CommitSink, MessageRecord, Segment, SeriesForm
 
 Item = TypeVar("Item")
 
@@ -68,7 +68,7 @@ class Series:
             self._segment = Segment(self._folder, number, self._form, time_ns)
         return self._segment
 
-    def commit(self, records: Sequence[Record], time_ns: int) -> None:
+    def commit(self, records: Sequence[MessageRecord], time_ns: int) -> None:
         """All of `records` on the disk when this returns, in a new segment when the present one is full or fails;
         OSError when the new one fails, too; FolderLost before anything is written. `time_ns` (now) decides whether a
         segment is old enough to be closed."""
@@ -80,7 +80,7 @@ class Series:
         except OSError:
             self._commit(self.open(time_ns), records)
 
-    def _commit(self, segment: Segment, records: Sequence[Record]) -> None:
+    def _commit(self, segment: Segment, records: Sequence[MessageRecord]) -> None:
         try:
             segment.commit(records)
         except OSError as error:
@@ -176,7 +176,7 @@ def next_number(folder: Path) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class SeriesReply:
     """What a call of a series came to; `error` beside the rest, for troubles are reported also when it failed."""
 
     result: object
@@ -212,14 +212,14 @@ class SessionSeries:
         self._space = SpaceWatch(directory, stop, alert, lambda: frames.reserved_bytes, self._notices.append)
         telemetry.open(time_ns)
 
-    def do(self, name: str, method: str, *args: object) -> Done:
+    def do(self, name: str, method: str, *args: object) -> SeriesReply:
         """A method of one series."""
         series, result, failure = self._series[name], None, None
         try:
             result = getattr(series, method)(*args)
         except OSError as error:
             failure = error
-        return Done(result, failure, series.is_open, _taken(series.troubles))
+        return SeriesReply(result, failure, series.is_open, _taken(series.troubles))
 
     def plan(self, size: Mapping[str, int]) -> None:
         """How many `steps` and `frames` the plan has."""
@@ -278,7 +278,7 @@ class DiskSeries:
         """As in Series, like all below."""
         self._do("check")
 
-    def commit(self, records: Sequence[Record], time_ns: int) -> None:
+    def commit(self, records: Sequence[MessageRecord], time_ns: int) -> None:
         """All of `records` on the disk."""
         self._do("commit", list(records), time_ns)
 
@@ -320,7 +320,7 @@ class DiskSeries:
             self._do("close")
 
     def _do(self, method: str, *args: object) -> object:
-        done: Done = self._ask("do", self._name, method, *args)
+        done: SeriesReply = self._ask("do", self._name, method, *args)
         self.is_open = done.is_open
         self.troubles.extend(done.troubles)
         if done.error is not None:
@@ -329,7 +329,7 @@ class DiskSeries:
 
 
 def open_series(
-    disk: Disk | None, directory: Path, form: SessionForm, time_ns: int, tell: Callable[[Event], None]
+    disk: DiskProcess | None, directory: Path, form: SessionForm, time_ns: int, tell: Callable[[Event], None]
 ) -> tuple[DiskSeries, DiskSeries]:
     """Frames and telemetry of a session, made or continued; raises OSError. disk: the process that has them, None: this
     one."""

@@ -21,10 +21,10 @@ from thermostand.foundation.readings import Frame, Quality
 from thermostand.recording.format import messages
 from thermostand.recording.format.kinds import KINDS, Kind
 from thermostand.recording.format.layout import TELEMETRY
-from thermostand.recording.writing.homes import Homes, Kept
+from thermostand.recording.writing.homes import FolderContents, Homes
 from thermostand.recording.writing.notices import DroppedReadings
 from thermostand.recording.writing.recorder_settings import RecordingSettings
-from thermostand.recording.writing.segment import Record
+from thermostand.recording.writing.segment import MessageRecord
 from thermostand.recording.writing.series import DiskSeries
 from thermostand.recording.writing.waiting import Waiting
 
@@ -39,6 +39,7 @@ class Telemetry:
         self,
         directory: Path,
         devices: Mapping[str, str],
+        *,
         settings: RecordingSettings,
         clock: Clock,
         waiting: Waiting,
@@ -62,7 +63,7 @@ class Telemetry:
         self.series = series
         self.lane = Lane("record-telemetry", self._clock, patient=False)
         self._writer = TelemetryWriter(series, self._encoder)
-        self.kept = Kept(self._clock.now_ns(), 0)
+        self.kept = FolderContents(self._clock.now_ns(), 0)
         self.taking = True
 
     @property
@@ -100,7 +101,7 @@ class Telemetry:
         failure = await self.lane.call(self._writer.save, items, now_ns)
         if failure is None:
             self._waiting.items_saved(commit)
-            self.kept = Kept(now_ns, self._writer.messages_saved)
+            self.kept = FolderContents(now_ns, self._writer.messages_saved)
             self._dropped.end(self._tell)
         self._homes.follow(TELEMETRY, failure, self.kept)
         self._waiting.changed()
@@ -137,25 +138,25 @@ class TelemetryEncoder:
         if isinstance(item, Batch) and item.device not in self._encoders:
             raise ValueError(f"{item.device} is not among the recorded devices {', '.join(self._encoders)}")
 
-    def encode(self, item: Item) -> Iterator[Record]:
+    def encode(self, item: Item) -> Iterator[MessageRecord]:
         """The item's records, most often one; a frame has none."""
         match item:
             case Batch():
                 encoder = self._encoders[item.device]
-                yield Record(encoder.topic, item.time_ns, encoder.encode(item))
+                yield MessageRecord(encoder.topic, item.time_ns, encoder.encode(item))
                 if self._devices[item.device] == "axis":
                     yield from self._pose(item)
             case Frame():
                 pass
             case Original():
-                yield Record(messages.ORIGINAL, item.time_ns, messages.encode_original(item))
+                yield MessageRecord(messages.ORIGINAL, item.time_ns, messages.encode_original(item))
             case StepMark():
-                yield Record(messages.STEP, item.time_ns, messages.encode_step(item))
+                yield MessageRecord(messages.STEP, item.time_ns, messages.encode_step(item))
             case Event():
-                yield Record(messages.EVENT, item.time_ns, messages.encode_event(item))
-                yield Record(messages.LOG, item.time_ns, messages.encode_log(item))
+                yield MessageRecord(messages.EVENT, item.time_ns, messages.encode_event(item))
+                yield MessageRecord(messages.LOG, item.time_ns, messages.encode_log(item))
 
-    def _pose(self, batch: Batch) -> Iterator[Record]:
+    def _pose(self, batch: Batch) -> Iterator[MessageRecord]:
         """The table's pose for viewers, once both axes have reported their positions; none while one has none."""
         for reading in batch.readings:
             if reading.channel == f"{batch.device}.position":
@@ -164,7 +165,7 @@ class TelemetryEncoder:
                     self._table[reading.unit] = reading.value
         if "mm" in self._table and "deg" in self._table:
             pose = messages.encode_table_pose(batch.time_ns, self._table["mm"], self._table["deg"])
-            yield Record(messages.TABLE_POSE, batch.time_ns, pose)
+            yield MessageRecord(messages.TABLE_POSE, batch.time_ns, pose)
 
 
 class BatchEncoder:
@@ -204,7 +205,7 @@ class TelemetryWriter:
     def __init__(self, series: DiskSeries, encoder: TelemetryEncoder) -> None:
         self._series = series
         self._encoder = encoder
-        self._backlog: list[Record] = []
+        self._backlog: list[MessageRecord] = []
         self._items_encoded = 0
         self.items_saved = 0
         self.messages_saved = 0

@@ -29,9 +29,9 @@ from thermostand.foundation.tasks import cancelled
 from thermostand.recording.exporting.archive import DELETED
 from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.reading.notes import read_notes
-from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.run_word import RunOutcome
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.running.session_files import info_of, recorder_in, tell_identities
@@ -46,7 +46,7 @@ class _Recording:
 
     recorder: Recorder
     tap: _Tap
-    disk: Disk
+    disk: DiskProcess
     task: asyncio.Task[None]
 
     async def complete(self, within_s: float, patience: Patience) -> None:
@@ -102,7 +102,7 @@ class DayRecord:
         day = self._today()
         info = await self._lane.call(self._place, day)
         directory = self._out / info.session_id
-        tap, disk = _Tap(self._assembly.hub), Disk()
+        tap, disk = _Tap(self._assembly.hub), DiskProcess()
         recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk)
         try:
             await recorder.begin(tuple)
@@ -134,7 +134,7 @@ class DayRecord:
         if self._now is None:
             return
         recording, self._now = self._now, None
-        ended = RUN_END.at(self._clock.now_ns(), "the record between runs ends", status=Run.COMPLETE)
+        ended = RUN_END.at(self._clock.now_ns(), "the record between runs ends", status=RunOutcome.COMPLETE)
         recording.tap.give(ended)
         recording.tap.close()
         self._cut_off.append(recording)

@@ -17,7 +17,7 @@ from thermostand.foundation.calls import Lane
 from thermostand.foundation.errors import ConfigError, SessionError, StandError
 from thermostand.foundation.readings import Quality
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, Disk, DiskCalls
+from thermostand.recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, DiskCalls, DiskProcess
 from thermostand.stand.config.checked import ATTACHMENT
 from thermostand.stand.estimating.run_estimate import Night, price_night, small_disk
 from thermostand.stand.queueing import queue
@@ -44,7 +44,7 @@ class Orders:
     def __init__(
         self,
         open_stand: OpenStand,
-        disk: Disk,
+        disk: DiskProcess,
         directory: Path,
         config_name: str,
         texts: dict[str, str],

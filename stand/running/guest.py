@@ -34,7 +34,7 @@ from thermostand.foundation.instants import duration, local_text
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.tasks import cause_of, failure_text, watched
 from thermostand.markers.target import Target
-from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.run_word import RunOutcome
 from thermostand.recording.writing.disk import NOTES_LINE, DiskCalls
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.stand.assembly import Assembly
@@ -340,7 +340,7 @@ class Guest:
         now_ns, last_utc_ns = clock.now_ns(), before.last_ns + before.utc_offset_ns
         if before.state.ended is None:
             ended = f"interrupted: killed after {local_text(last_utc_ns)}"
-            log.tell(RUN_END, ended, status=Run.INTERRUPTED)
+            log.tell(RUN_END, ended, status=RunOutcome.INTERRUPTED)
         to_utc_ns = now_ns + utc_offset_ns(clock)
         log.tell(GAP, duration(now_ns - before.last_ns), from_ns=last_utc_ns, to_ns=to_utc_ns)
         if before.state.tripped:

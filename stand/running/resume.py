@@ -23,7 +23,7 @@ from thermostand.foundation.progress import late_progress
 from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.format.restarts import frames_lost_of, restarted_step
-from thermostand.recording.reading.run_word import Run, last_run_event
+from thermostand.recording.reading.run_word import RunOutcome, last_run_event
 from thermostand.recording.reading.scan import scan
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
@@ -164,7 +164,7 @@ def folded(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
 
 def _check_may_go_on(directory: Path, state: RunState, clear: bool) -> None:
     """SessionError when the run is complete, or has tripped and was not cleared."""
-    if state.ended is not None and state.ended.status == Run.COMPLETE:
+    if state.ended is not None and state.ended.status == RunOutcome.COMPLETE:
         raise SessionError(f"{directory}: its run is complete; there is nothing to resume")
     if state.tripped and not clear:
         raise SessionError(f"{directory}: the stand tripped: {state.tripped}; look into it, then resume with --clear")
@@ -214,9 +214,9 @@ def _recorded_end(session: Session, entries: Sequence[Entry]) -> tuple[Entry, ..
     if isinstance(entries[-1], Ended) or event is None or event.kind != RUN_END or event.time_ns < entries[-1].time_ns:
         return ()
     status = event.data.get("status")
-    if status == Run.TRIPPED:
+    if status == RunOutcome.TRIPPED:
         return (Tripped(event.time_ns, "", event.text), Ended(event.time_ns, "tripped", event.text))
-    return (Ended(event.time_ns, "complete", event.text),) if status == Run.COMPLETE else ()
+    return (Ended(event.time_ns, "complete", event.text),) if status == RunOutcome.COMPLETE else ()
 
 
 def _recorded_begun(session: Session) -> Begun:

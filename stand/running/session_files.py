@@ -22,7 +22,7 @@ from thermostand.foundation.items import Event
 from thermostand.markers.target import Target
 from thermostand.recording.format.images import MarkerWindows
 from thermostand.recording.format.kinds import KINDS
-from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
 from thermostand.stand.assembly import Assembly, device_kinds
@@ -75,7 +75,7 @@ def tell_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
 
 
 def recorder_of(
-    order: Order, directory: Path, info: SessionInfo, assembly: Assembly, disk: Disk | None = None
+    order: Order, directory: Path, info: SessionInfo, assembly: Assembly, disk: DiskProcess | None = None
 ) -> Recorder:
     """The recorder of this run; `disk` is the process that touches the disk for it."""
     windows = _partial_frames(order)
@@ -93,7 +93,7 @@ def recorder_in(
     config: StandConfig,
     hub: Hub,
     clock: Clock,
-    disk: Disk | None = None,
+    disk: DiskProcess | None = None,
     windows: MarkerWindows | None = None,
 ) -> Recorder:
     """A recorder with the stand's settings. `roi` frames need `windows`; without them they are whole."""
@@ -104,7 +104,7 @@ def recorder_in(
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
     kinds = {name: kind if kind in KINDS else "relays" for name, kind in device_kinds(config).items()}
-    return Recorder(directory, info, attachments, kinds, hub, clock, settings, windows, disk)
+    return Recorder(directory, info, attachments, kinds, hub, clock, settings=settings, prepare=windows, disk=disk)
 
 
 def _commit_s(recording: RecordingConfig, clock: Clock) -> float:

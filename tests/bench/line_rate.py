@@ -66,7 +66,7 @@ class Recording:
         self._hub = Hub()
         self._clock = WallClock()
         settings = RecordingSettings("raw")
-        self.recorder = Recorder(directory, INFO, {}, {}, self._hub, self._clock, settings)
+        self.recorder = Recorder(directory, INFO, {}, {}, self._hub, self._clock, settings=settings)
         self._published = 0
 
     async def begin(self) -> None:

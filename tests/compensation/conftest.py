@@ -97,7 +97,7 @@ async def recording(
     clock, hub = VirtualClock(START_NS), Hub()
     info = SessionInfo(session_id or directory.name, recipe, serials, "operator", "0.1.0", "virtual")
     settings = RecordingSettings(telemetry_commit_s=60.0)
-    recorder = Recorder(directory, info, dict(attachments), dict(devices), hub, clock, settings)
+    recorder = Recorder(directory, info, dict(attachments), dict(devices), hub, clock, settings=settings)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
     yield hub, clock

@@ -20,7 +20,7 @@ from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, read_manifest
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
 from thermostand.recording.writing.manifest_file import complete_manifest
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import BatchEncoder
 
@@ -51,9 +51,11 @@ def frame(index):
 def telemetry_of(index):
     time_ns = START_NS + index * NS_PER_S
     air = Reading("thermometers.air", 20 + index / 2, "degC", time_ns)
-    yield Record(ENCODER.topic, time_ns, ENCODER.encode(Batch("thermometers", time_ns, (air,))))
+    yield MessageRecord(ENCODER.topic, time_ns, ENCODER.encode(Batch("thermometers", time_ns, (air,))))
     for event in range(index % 3):  # alike, so that they compress
-        yield Record(messages.EVENT, time_ns, messages.encode_event(Event(time_ns, "info", "note", f"{event} " * 40)))
+        yield MessageRecord(
+            messages.EVENT, time_ns, messages.encode_event(Event(time_ns, "info", "note", f"{event} " * 40))
+        )
 
 
 def frame_of(index):
@@ -69,7 +71,7 @@ class Block:
 
     begin: int
     end: int
-    messages: tuple[Record, ...]
+    messages: tuple[MessageRecord, ...]
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def read_segment(path):
     if path.parent.name == FRAMES:
         return [record for place in frame_places(path) for record in records_at(place)]
     read = list(telemetry_messages(path, lambda channel: True))
-    return [Record(message.topic, message.time_ns, message.data, message.sequence) for message in read]
+    return [MessageRecord(message.topic, message.time_ns, message.data, message.sequence) for message in read]
 
 
 def records_at(place):
@@ -153,8 +155,8 @@ def records_at(place):
         read_frame(place),
         (place.sequence, place.meta.published_ns),
     )
-    yield Record(topics.meta, place.time_ns, frame.meta, *stamps)
-    yield Record(topics.image, place.time_ns, bytes(frame.image), *stamps)
+    yield MessageRecord(topics.meta, place.time_ns, frame.meta, *stamps)
+    yield MessageRecord(topics.image, place.time_ns, bytes(frame.image), *stamps)
 
 
 def names(directory: Path):

@@ -68,7 +68,7 @@ async def record(
     """Publish `items(time_ns, index)` each period; returns all that were published."""
     clock, hub, published = VirtualClock(START_NS), Hub(), []
     settings = RecordingSettings(encoding, telemetry_commit_s=1.0, segment_s=segment_s)
-    recorder = Recorder(directory, INFO, attachments, DEVICES, hub, clock, settings)
+    recorder = Recorder(directory, INFO, attachments, DEVICES, hub, clock, settings=settings)
     hub.subscribe(published.append)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]

@@ -67,7 +67,7 @@ async def record(directory, seconds=5, items=one_second, settings=SETTINGS, info
     events published, the recorder's own among them."""
     clock, hub, events = VirtualClock(START_NS), Hub(), []
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
-    recorder = Recorder(directory, info, ATTACHMENTS, DEVICES, hub, clock, settings)
+    recorder = Recorder(directory, info, ATTACHMENTS, DEVICES, hub, clock, settings=settings)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
     try:
@@ -107,7 +107,7 @@ def committed_event_texts(directory):
 async def start(directory, settings, encode=None):
     """A recorder that runs on a virtual clock; returns it, its clock, its hub and its tasks."""
     clock, hub = VirtualClock(START_NS), Hub()
-    recorder = Recorder(directory, INFO, ATTACHMENTS, DEVICES, hub, clock, settings, encode)
+    recorder = Recorder(directory, INFO, ATTACHMENTS, DEVICES, hub, clock, settings=settings, prepare=encode)
     recorder.start()
     return recorder, clock, hub, [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
 

@@ -3,15 +3,15 @@
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.images import Circumstances
 from thermostand.recording.writing.forms import frames_topics
-from thermostand.recording.writing.frames import Published, frame_records
-from thermostand.recording.writing.segment import Record
+from thermostand.recording.writing.frames import PublishedFrame, frame_records
+from thermostand.recording.writing.segment import MessageRecord
 
 CAMERA_TOPICS = frames_topics({"camera": "camera"})
 
 
-def stored(frame: Frame, published_ns: int | None = None) -> list[Record]:
+def stored(frame: Frame, published_ns: int | None = None) -> list[MessageRecord]:
     """The two messages of a frame, published at its own instant unless another is given."""
-    return frame_records(Published(frame, Circumstances(frame.time_ns if published_ns is None else published_ns)))
+    return frame_records(PublishedFrame(frame, Circumstances(frame.time_ns if published_ns is None else published_ns)))
 
 
 def described(frame: Frame) -> bytes:

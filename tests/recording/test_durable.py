@@ -31,7 +31,7 @@ class Stand:
 
     def __init__(self, directory, settings, clock):
         self.clock, self.hub, self.events, self.second = clock, Hub(), [], 0
-        self.recorder = Recorder(directory, INFO, ATTACHMENTS, DEVICES, self.hub, clock, settings)
+        self.recorder = Recorder(directory, INFO, ATTACHMENTS, DEVICES, self.hub, clock, settings=settings)
         self.hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
 
     async def seconds(self, count, frames=False):

@@ -34,7 +34,7 @@ class Night:
 
     def __init__(self, directory, settings):
         self.clock, self.hub, self.events = VirtualClock(START_NS), Hub(), []
-        self.recorder = Recorder(directory, INFO, {}, {}, self.hub, self.clock, settings)
+        self.recorder = Recorder(directory, INFO, {}, {}, self.hub, self.clock, settings=settings)
         self.hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
         self.published = 0
 

@@ -18,7 +18,7 @@ from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.messages import TABLE_POSE
 from thermostand.recording.format.summary import read_summary
 from thermostand.recording.reading.overview import overview
-from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
@@ -72,14 +72,14 @@ def refused(directory):
 
 
 def test_a_whole_run_is_complete_and_sound(whole):
-    assert words(whole) == (Run.COMPLETE, Files.SOUND)
+    assert words(whole) == (RunOutcome.COMPLETE, Files.SOUND)
     assert open_whole(whole).holes == ()
 
 
 def test_a_lost_tail_of_both_series_is_incomplete(session):
     remove(session, TELEMETRY, *last_numbers(session, TELEMETRY, 2))
     remove(session, FRAMES, *last_numbers(session, FRAMES, 2))
-    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert words(session) == (RunOutcome.COMPLETE, Files.INCOMPLETE)
     assert errors(session) == [
         "error: telemetry/0004.mcap: is missing, with all that followed: journal.jsonl says that the run ended at "
         "2026-01-01 18:00:20 UTC, the telemetry stops at 2026-01-01 18:00:14 UTC; "
@@ -97,29 +97,29 @@ def test_a_lost_tail_of_both_series_is_incomplete(session):
 
 def test_frames_deleted_from_the_end_alone_are_missed_by_their_steps(session):
     remove(session, FRAMES, *last_numbers(session, FRAMES, 1))
-    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert words(session) == (RunOutcome.COMPLETE, Files.INCOMPLETE)
     assert "missing: frames/0004.mcap and what follows it (from 2026-01-01 18:00:15 UTC, 4 frames" in refused(session)
     shutil.rmtree(session / FRAMES)
-    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert words(session) == (RunOutcome.COMPLETE, Files.INCOMPLETE)
     assert "missing: frames/0000.mcap and what follows it (20 frames of steps that are done)" in refused(session)
 
 
 def test_without_its_journal_a_lost_tail_leaves_no_end_and_is_incomplete(session):
     (session / "journal.jsonl").unlink()
-    assert words(session) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert words(session) == (RunOutcome.COMPLETE, Files.INCOMPLETE)
     (text,) = errors(session)
     assert text == "error: journal.jsonl: is missing; what the recording itself says of the run counts"
     assert open_whole(session).holes == ()  # everything that was recorded is there
     for series in (TELEMETRY, FRAMES):
         remove(session, series, *last_numbers(session, series, 2))
-    assert words(session) == (Run.INTERRUPTED, Files.INCOMPLETE)
+    assert words(session) == (RunOutcome.INTERRUPTED, Files.INCOMPLETE)
     assert "the recording stops at 2026-01-01 18:00:14 UTC without an end of its run" in errors(session)[1]
     assert "telemetry/0004.mcap and what follows it" in refused(session)
 
 
 async def test_steps_that_the_journal_has_and_the_telemetry_has_not_are_missed(tmp_path):
     directory = await record_run(tmp_path / "s", items=killed, status="")
-    assert words(directory) == (Run.INTERRUPTED, Files.SOUND)  # killed between two segments
+    assert words(directory) == (RunOutcome.INTERRUPTED, Files.SOUND)  # killed between two segments
     remove(directory, TELEMETRY, *last_numbers(directory, TELEMETRY, 2))
     remove(directory, FRAMES, *last_numbers(directory, FRAMES, 2))
     assert any("says that 20 steps are done, 5 more than the telemetry" in text for text in errors(directory))
@@ -128,7 +128,7 @@ async def test_steps_that_the_journal_has_and_the_telemetry_has_not_are_missed(t
 
 async def test_what_was_recorded_after_a_resumption_and_is_gone_is_missed(tmp_path):
     directory = await record_run(tmp_path / "s", items=ended("error", "aborted", status="stopped"), status="stopped")
-    assert words(directory) == (Run.STOPPED, Files.SOUND)
+    assert words(directory) == (RunOutcome.STOPPED, Files.SOUND)
     after_ns = START_NS + 3600 * NS_PER_S
     write_journal(
         directory,
@@ -136,19 +136,19 @@ async def test_what_was_recorded_after_a_resumption_and_is_gone_is_missed(tmp_pa
         {"entry": "Gap", "from_ns": START_NS, "time_ns": after_ns},
         {"entry": "Ended", "time_ns": after_ns + NS_PER_S, "status": "complete", "text": "complete"},
     )
-    assert words(directory) == (Run.COMPLETE, Files.INCOMPLETE)
+    assert words(directory) == (RunOutcome.COMPLETE, Files.INCOMPLETE)
     assert any("says that the run was resumed at 2026-01-01 19:00:00 UTC" in text for text in errors(directory))
 
 
 @pytest.mark.parametrize(
     ("level", "text", "data", "status", "word"),
     [
-        ("info", "complete", {"status": "complete"}, "complete", Run.COMPLETE),
-        ("error", "aborted: stopped", {"status": "stopped"}, "stopped", Run.STOPPED),
-        ("error", "aborted: too hot", {"status": "tripped"}, "tripped", Run.TRIPPED),
-        ("error", "failed: a device", {"status": "failed"}, "failed", Run.FAILED),
-        ("error", "aborted: too hot", {}, "tripped", Run.TRIPPED),
-        ("info", "complete", {}, "complete", Run.COMPLETE),
+        ("info", "complete", {"status": "complete"}, "complete", RunOutcome.COMPLETE),
+        ("error", "aborted: stopped", {"status": "stopped"}, "stopped", RunOutcome.STOPPED),
+        ("error", "aborted: too hot", {"status": "tripped"}, "tripped", RunOutcome.TRIPPED),
+        ("error", "failed: a device", {"status": "failed"}, "failed", RunOutcome.FAILED),
+        ("error", "aborted: too hot", {}, "tripped", RunOutcome.TRIPPED),
+        ("info", "complete", {}, "complete", RunOutcome.COMPLETE),
     ],
 )
 async def test_a_run_has_its_own_word_and_its_files_are_sound(tmp_path, level, text, data, status, word):
@@ -160,7 +160,7 @@ async def test_steps_are_counted_against_the_plan(tmp_path):
     directory = await record_run(tmp_path / "s", items=half_done, status="")
     write_journal(directory, *entries(SECONDS // 2, "stopped"))
     found = overview(directory)
-    assert (found.scanned.run, found.planned_steps) == (Run.STOPPED, SECONDS)
+    assert (found.scanned.run, found.planned_steps) == (RunOutcome.STOPPED, SECONDS)
     assert [step.state for step in found.steps].count(StepState.DONE) == SECONDS // 2
 
 
@@ -235,7 +235,7 @@ async def test_the_copy_of_an_incomplete_session_lacks_the_same_and_invents_noth
     assert recorded_items(copy) == recorded_items(original)
     assert images(copy) == images(original)
     assert holes_of(copy) == holes_of(original)
-    assert words(tmp_path / "copy") == (Run.COMPLETE, Files.INCOMPLETE)
+    assert words(tmp_path / "copy") == (RunOutcome.COMPLETE, Files.INCOMPLETE)
     assert refused(tmp_path / "copy").partition(": is")[2] == refused(session).partition(": is")[2]
     twice = Session.open(await replay_and_record(copy, tmp_path / "twice", None))
     assert holes_of(twice) == holes_of(original)
@@ -244,10 +244,10 @@ async def test_the_copy_of_an_incomplete_session_lacks_the_same_and_invents_noth
 def test_a_part_lacks_what_the_session_lacked_in_its_range_and_no_more(session, tmp_path):
     original = missing_middle(session)
     trim(original, tmp_path / "all", START_NS - NS_PER_S, START_NS + 100 * NS_PER_S)
-    assert words(tmp_path / "all") == (Run.COMPLETE, Files.INCOMPLETE)
+    assert words(tmp_path / "all") == (RunOutcome.COMPLETE, Files.INCOMPLETE)
     assert len(open_whole(tmp_path / "all", lambda text: None).holes) == len(original.holes)
     trim(original, tmp_path / "sound", START_NS + 14 * NS_PER_S, START_NS + 17 * NS_PER_S)
-    assert words(tmp_path / "sound") == (Run.COMPLETE, Files.SOUND)
+    assert words(tmp_path / "sound") == (RunOutcome.COMPLETE, Files.SOUND)
     (note,) = map(str, verify(tmp_path / "sound").findings[:1])
     assert note.startswith("note: a part of the session night-1: 2026-01-01 18:00:14 to 2026-01-01 18:00:17 UTC")
 
@@ -256,9 +256,9 @@ async def test_a_part_is_sound_however_its_run_ended_and_so_is_a_part_of_it(tmp_
     directory = await record_run(tmp_path / "s", items=half_done, status="")
     write_journal(directory, *entries(SECONDS // 2, "stopped"))
     trim(Session.open(directory), tmp_path / "part", START_NS, START_NS + 5 * NS_PER_S)
-    assert words(tmp_path / "part") == (Run.STOPPED, Files.SOUND)
+    assert words(tmp_path / "part") == (RunOutcome.STOPPED, Files.SOUND)
     trim(Session.open(tmp_path / "part"), tmp_path / "less", START_NS + NS_PER_S, START_NS + 9 * NS_PER_S)
-    assert words(tmp_path / "less") == (Run.STOPPED, Files.SOUND)
+    assert words(tmp_path / "less") == (RunOutcome.STOPPED, Files.SOUND)
     assert "18:00:01 to 2026-01-01 18:00:05 UTC" in str(verify(tmp_path / "less").findings[0])
 
 
@@ -270,16 +270,16 @@ async def test_what_a_kill_cost_is_no_hole_and_its_copies_are_sound(tmp_path):
     last.with_name(f"{last.name}.part").write_bytes(last.read_bytes()[: chunk.offset + 30])
     last.unlink()
     unlist(last)
-    assert words(directory) == (Run.INTERRUPTED, Files.INCOMPLETE)
+    assert words(directory) == (RunOutcome.INTERRUPTED, Files.INCOMPLETE)
     salvage_session(directory)
     write_journal(directory, *entries(16, ""))
-    assert words(directory) == (Run.INTERRUPTED, Files.SOUND)
+    assert words(directory) == (RunOutcome.INTERRUPTED, Files.SOUND)
     assert open_whole(directory).holes == ()
     copy = await replay_and_record(Session.open(directory), tmp_path / "copy", None)
-    assert words(copy) == (Run.INTERRUPTED, Files.SOUND)
+    assert words(copy) == (RunOutcome.INTERRUPTED, Files.SOUND)
     assert telemetry(Session.open(copy)) == telemetry(Session.open(directory))
     part = trim(Session.open(directory), tmp_path / "part", START_NS, START_NS + 100 * NS_PER_S)
-    assert words(part) == (Run.INTERRUPTED, Files.SOUND)
+    assert words(part) == (RunOutcome.INTERRUPTED, Files.SOUND)
 
 
 async def test_frames_the_recorder_said_it_lost_are_no_hole(tmp_path):

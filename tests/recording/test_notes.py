@@ -13,7 +13,7 @@ from thermostand.recording.reading.notes import (
     NOTES_NAME,
     Archived,
     Note,
-    Notes,
+    SessionNotes,
     add_archived,
     add_note,
     add_tags,
@@ -27,14 +27,14 @@ def test_notes_and_tags_are_kept_in_order(tmp_path: Path):
     add_tags(tmp_path, ["paper", "2026"], "jan", 7)
     add_tags(tmp_path, ["lens-B"], "jan", 8, remove=True)
     add_archived(tmp_path, Archived("/nas/night", 9, "0f"), "jan")
-    assert read_notes(tmp_path) == Notes(
+    assert read_notes(tmp_path) == SessionNotes(
         (Note(5, "eva", "door opened\n at 19:10"),), ("paper", "2026"), (Archived("/nas/night", 9, "0f"),)
     )
 
 
 def test_without_a_file_nothing_was_said(tmp_path: Path):
-    assert read_notes(tmp_path) == Notes()
-    assert read_notes(tmp_path / "nowhere") == Notes()
+    assert read_notes(tmp_path) == SessionNotes()
+    assert read_notes(tmp_path / "nowhere") == SessionNotes()
 
 
 def test_a_torn_or_damaged_line_costs_only_itself(tmp_path: Path):
@@ -65,15 +65,15 @@ def test_a_tag_is_a_word(tmp_path: Path, tag: str):
 def test_links_and_pipes_are_no_notes(tmp_path: Path):
     (tmp_path / "other").write_text("")
     (tmp_path / NOTES_NAME).symlink_to(tmp_path / "other")
-    assert read_notes(tmp_path) == Notes()
+    assert read_notes(tmp_path) == SessionNotes()
     with pytest.raises(SessionError, match="could not be kept"):
         add_note(tmp_path, "x", "eva", 1)
     (tmp_path / NOTES_NAME).unlink()
     (tmp_path / NOTES_NAME).mkdir()
-    assert read_notes(tmp_path) == Notes()
+    assert read_notes(tmp_path) == SessionNotes()
     (tmp_path / NOTES_NAME).rmdir()
     os.mkfifo(tmp_path / NOTES_NAME)
-    assert read_notes(tmp_path) == Notes()
+    assert read_notes(tmp_path) == SessionNotes()
     with pytest.raises(SessionError, match="is no file of notes"):
         add_note(tmp_path, "x", "eva", 1)
 
@@ -98,7 +98,7 @@ sys.exit(3)
     assert subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False).returncode == 0
     assert read_notes(tmp_path).tags == ()
     add_tags(tmp_path, ["keep"], "eva", 3)
-    assert read_notes(tmp_path) == Notes((Note(1, "eva", "first"),), ("keep",))
+    assert read_notes(tmp_path) == SessionNotes((Note(1, "eva", "first"),), ("keep",))
 
 
 def test_a_folder_that_is_a_link_gets_no_note(tmp_path: Path):

@@ -12,7 +12,7 @@ from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.instants import date_time, duration, parse_instant, utc_text
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading, bad_reading
-from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.format.inventory import SegmentState, inventory
 from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.scan import scan
 
@@ -65,7 +65,7 @@ async def test_a_glance_tells_what_when_and_how_much(session):
     assert seen.size_bytes == sum(path.stat().st_size for path in files)
     assert seen.metadata["recipe"] == "thermal_cycle"
     assert list(seen.attachments) == list(ATTACHMENTS)
-    assert seen.count(State.FINISHED) == len(files)
+    assert seen.count(SegmentState.FINISHED) == len(files)
 
 
 async def test_the_overview_has_the_steps_as_they_went(session):
@@ -189,7 +189,7 @@ async def test_a_look_leaves_no_lock(session):
     assert inventory(session)
     with part.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        assert [entry.state for entry in inventory(session) if entry.path == part] == [State.RECORDING]
+        assert [entry.state for entry in inventory(session) if entry.path == part] == [SegmentState.RECORDING]
 
 
 def test_a_folder_without_segments_is_no_session(tmp_path):

@@ -232,7 +232,7 @@ CASES = {
         lambda s: ((s / MANIFEST_NAME).unlink(), (s / MANIFEST_NAME).mkdir()), Files.DAMAGED, MANIFEST_NAME, True
     ),
     "a manifest of wrong types, with the right checksum": (
-        lambda s: remake_manifest(s, segments={"frames/0000.mcap": Sealed("x", 7, {})}),
+        lambda s: remake_manifest(s, segments={"frames/0000.mcap": Sealed(*["x", 7, {}])}),
         Files.DAMAGED, MANIFEST_NAME, True,
     ),
     "a segment that the manifest does not list": (

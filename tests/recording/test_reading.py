@@ -24,7 +24,7 @@ from thermostand.recording.format.records import frame_places, telemetry_message
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import frames_topics, telemetry_topics
 from thermostand.recording.writing.recorder import Recorder
-from thermostand.recording.writing.segment import Record, SeriesForm
+from thermostand.recording.writing.segment import MessageRecord, SeriesForm
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import BatchEncoder, TelemetryEncoder
 
@@ -339,7 +339,7 @@ def test_wrong_content_under_right_crcs_is_reported(tmp_path, change, sentence):
 
 def test_a_step_nested_deeper_than_python_goes_is_reported(tmp_path):
     step = messages.CLASSES[messages.STEP](state="done", parameters_json="[" * 200_000).SerializeToString()
-    write(tmp_path / TELEMETRY, telemetry_topics({}), [[Record(messages.STEP, START_NS, step)]])
+    write(tmp_path / TELEMETRY, telemetry_topics({}), [[MessageRecord(messages.STEP, START_NS, step)]])
     with pytest.raises(SessionError, match="a recorded step cannot be read"):
         Session.open(tmp_path).steps()
 

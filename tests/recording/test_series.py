@@ -17,7 +17,7 @@ from tests.recording.disks import ext4, limit_files, run, tmpfs
 from thermostand.recording.format.layout import segment_metadata
 from thermostand.recording.format.messages import CLASSES, EVENT, LOG
 from thermostand.recording.writing.home import FolderLost
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic, merge_chunks
+from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic, merge_chunks
 from thermostand.recording.writing.series import Series, next_number
 
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
@@ -43,7 +43,7 @@ def records(commit, size_bytes=60):
     """Eight messages that do not compress, in no order of time."""
     noise = random.Random(commit)
     return [
-        Record(
+        MessageRecord(
             noise.choice((EVENT, LOG)), noise.randrange(10**9), noise.randbytes(size_bytes), noise.randrange(1 << 32)
         )
         for _ in range(RECORDS_PER_COMMIT)
@@ -75,7 +75,7 @@ def collect_messages(path, found):
                 topics[record.id] = record.topic
             elif isinstance(record, Message):
                 assert record.publish_time == record.log_time
-                found.append(Record(topics[record.channel_id], record.log_time, record.data, record.sequence))
+                found.append(MessageRecord(topics[record.channel_id], record.log_time, record.data, record.sequence))
 
 
 def all_records(commits, size_bytes=60):

@@ -13,7 +13,7 @@ from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
+from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.telemetry import BatchEncoder
 
@@ -35,9 +35,9 @@ def telemetry_of(second):
     """The records of one second; temperatures 20.0, 20.5, ... degC."""
     time_ns = START_NS + second * NS_PER_S
     air = Reading("thermometers.air", 20 + second / 2, "degC", time_ns)
-    yield Record(ENCODER.topic, time_ns, ENCODER.encode(Batch("thermometers", time_ns, (air,))))
-    yield Record(messages.STEP, time_ns, messages.encode_step(mark(second)))
-    yield Record(messages.EVENT, time_ns, messages.encode_event(event(second)))
+    yield MessageRecord(ENCODER.topic, time_ns, ENCODER.encode(Batch("thermometers", time_ns, (air,))))
+    yield MessageRecord(messages.STEP, time_ns, messages.encode_step(mark(second)))
+    yield MessageRecord(messages.EVENT, time_ns, messages.encode_event(event(second)))
 
 
 def mark(second):
@@ -230,7 +230,7 @@ def test_foreign_messages_on_a_topic_of_ours_are_refused(tmp_path):
         tmp_path / TELEMETRY,
         [0],
         form(TELEMETRY, topics, CompressionType.ZSTD),
-        lambda k: [Record(ENCODER.topic, START_NS, data)],
+        lambda k: [MessageRecord(ENCODER.topic, START_NS, data)],
     )
     with pytest.raises(SessionError, match=r"/sensors/temperature holds thermostand\.Event"):
         Session.open(tmp_path).readings("thermometers.air")

@@ -11,14 +11,14 @@ from typing import NoReturn
 
 from thermostand.foundation.clock import Now, WallClock
 from thermostand.foundation.patience import Patience
-from thermostand.recording.writing.disk import QUEUE_LINE, Disk, DiskCalls
+from thermostand.recording.writing.disk import QUEUE_LINE, DiskCalls, DiskProcess
 from thermostand.stand.queueing.queue_file import Entry, working
 from thermostand.stand.queueing.queue_work import Notes, RunOne, drain
 
 
 async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None]) -> None:
     """The queue of a folder, by a process for its disk as a daemon has one."""
-    disk = Disk()
+    disk = DiskProcess()
     calls = DiskCalls(disk, QUEUE_LINE, WallClock())
     try:
         with working(directory):

@@ -12,7 +12,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.disk import DiskProcess
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.daemon import systemd
@@ -138,7 +138,7 @@ async def test_a_run_whose_report_fails_is_an_event_and_the_next_has_its_turn(tm
 
 
 async def test_a_run_is_queued_only_when_what_it_needs_answers(tmp_path: Path):
-    config, clock, disk = load_config(packaged("", "simulated")), WallClock(), Disk()
+    config, clock, disk = load_config(packaged("", "simulated")), WallClock(), DiskProcess()
     texts = {
         "config.yaml": packaged("", "simulated").read_text(),
         "target.yaml": packaged("targets", config.target).read_text(),

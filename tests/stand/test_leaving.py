@@ -15,7 +15,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.patience import BUDGET_S, LEAST_S, Patience
-from thermostand.recording.writing.disk import FILES_LINE, QUEUE_LINE, Disk, DiskCalls
+from thermostand.recording.writing.disk import FILES_LINE, QUEUE_LINE, DiskCalls, DiskProcess
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from thermostand.stand.chamber.compressor import CompressorFile, CompressorState
 from thermostand.stand.daemon.daemon_file import Kept, KeptFile
@@ -108,8 +108,8 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
 
     async def leave(hung: Callable[[], None]) -> None:
         hub, clock, stop = Hub(), WallClock(), Stop(has_signals=False)
-        disk, own = Disk(), Disk()
-        recorder = Recorder(tmp_path / "night-1", INFO, {}, {}, hub, clock, SETTINGS, disk=disk)
+        disk, own = DiskProcess(), DiskProcess()
+        recorder = Recorder(tmp_path / "night-1", INFO, {}, {}, hub, clock, settings=SETTINGS, disk=disk)
         await recorder.begin(tuple)
         recording = asyncio.create_task(recorder.run())
         log, journal = Logbook(hub, clock, RunState(())), Journal.create(recorder.directory)

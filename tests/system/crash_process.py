@@ -14,7 +14,7 @@ from pathlib import Path
 from tests.system.recording_process import INFO, MESSAGES_PER_ROUND, SETTINGS, batches_of, frame_of
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
-from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.stand.chamber.compressor import CompressorState, keep
 from thermostand.stand.queueing.queue_file import changing
@@ -92,11 +92,11 @@ async def compressed(path, marks):
 
 
 async def main(folder, marks_path):
-    clock, hub, disk = WallClock(), Hub(), Disk()
+    clock, hub, disk = WallClock(), Hub(), DiskProcess()
     marks = Marks(marks_path, folder / CONTROL)
     (folder / QUEUE).mkdir()
     texts, devices = {"config.yaml": "a: 1\n"}, {"thermometers": "thermometers"}
-    recorder = Recorder(folder / SESSION, INFO, texts, devices, hub, clock, SETTINGS, disk=disk)
+    recorder = Recorder(folder / SESSION, INFO, texts, devices, hub, clock, settings=SETTINGS, disk=disk)
     await recorder.begin(tuple)
     journal = Journal.create(folder / SESSION)
     journal.start(clock, print, disk)

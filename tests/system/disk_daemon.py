@@ -19,7 +19,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
-from thermostand.recording.writing.disk import Disk
+from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from thermostand.stand.running.memory.entries import Begun, Dwell, Ended
 from thermostand.stand.running.memory.journal import Journal, Logbook
@@ -48,9 +48,9 @@ async def publish(hub, clock, journal):
 
 
 async def main(directory):
-    clock, hub, disk, stopped = WallClock(), Hub(), Disk(), asyncio.Event()
+    clock, hub, disk, stopped = WallClock(), Hub(), DiskProcess(), asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopped.set)
-    recorder = Recorder(directory, INFO, {}, {}, hub, clock, SETTINGS, disk=disk)
+    recorder = Recorder(directory, INFO, {}, {}, hub, clock, settings=SETTINGS, disk=disk)
     await recorder.begin(tuple)
     recording = asyncio.create_task(recorder.run())
     log, journal = Logbook(hub, clock, RunState(())), Journal.create(directory)

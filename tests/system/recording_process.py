@@ -25,7 +25,7 @@ from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
-from thermostand.recording.writing.segment import Record
+from thermostand.recording.writing.segment import MessageRecord
 from thermostand.recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
@@ -69,7 +69,7 @@ def telemetry_records(rounds):
     """The same for the telemetry."""
     records = []
     for index in range(rounds):
-        records += [Record(ENCODER.topic, batch.time_ns, ENCODER.encode(batch)) for batch in batches_of(index)]
+        records += [MessageRecord(ENCODER.topic, batch.time_ns, ENCODER.encode(batch)) for batch in batches_of(index)]
     return records
 
 
@@ -77,7 +77,7 @@ async def record(directory):
     """Record until killed; progress goes to the standard output."""
     clock, hub = WallClock(), Hub()
     recorder = Recorder(
-        directory, INFO, {"config.yaml": "a: 1\n"}, {"thermometers": "thermometers"}, hub, clock, SETTINGS
+        directory, INFO, {"config.yaml": "a: 1\n"}, {"thermometers": "thermometers"}, hub, clock, settings=SETTINGS
     )
     recorder.start()
     running = asyncio.create_task(recorder.run())

@@ -20,7 +20,7 @@ from tests.system.test_run_ends import SHORTER
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.items import StepState
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
-from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
@@ -52,9 +52,9 @@ async def test_a_stopped_run_goes_on_without_the_first_line_of_its_journal_and_o
     with pytest.raises(Interrupted):
         await run_virtual(ordered, out, 7, at_step("capture", lambda: os.kill(os.getpid(), signal.SIGINT)))
     (directory,) = out.iterdir()
-    assert (scan(directory).run, verify(directory).files) == (Run.STOPPED, Files.SOUND)
+    assert (scan(directory).run, verify(directory).files) == (RunOutcome.STOPPED, Files.SOUND)
     count = flip(directory, 0, 2, -1)
-    assert (verify(directory).run, verify(directory).files) == (Run.STOPPED, Files.DAMAGED)
+    assert (verify(directory).run, verify(directory).files) == (RunOutcome.STOPPED, Files.DAMAGED)
     before = await asyncio.to_thread(interruption, directory)
     assert before.seed == 7
     await resume(before, ignore)
@@ -64,17 +64,17 @@ async def test_a_stopped_run_goes_on_without_the_first_line_of_its_journal_and_o
     (damage,) = [event for event in session.events() if event.kind == "journal_damaged"]
     assert damage.text.startswith(f"journal.jsonl: line 1 and 2 more of {count} are damaged; the lines after it count")
     assert len((directory / "journal.jsonl.damaged").read_bytes().splitlines()) == count
-    assert (verify(directory).run, verify(directory).files) == (Run.COMPLETE, Files.DAMAGED)
+    assert (verify(directory).run, verify(directory).files) == (RunOutcome.COMPLETE, Files.DAMAGED)
 
 
 async def test_a_run_whose_end_its_journal_has_lost_is_ended_by_the_recording(
     tmp_path: Path, order: Callable[..., Order]
 ):
     directory = await run_virtual(order(SHORTER), tmp_path / "out", None, ignore)
-    assert (verify(directory).run, verify(directory).files) == (Run.COMPLETE, Files.SOUND)
+    assert (verify(directory).run, verify(directory).files) == (RunOutcome.COMPLETE, Files.SOUND)
     copy = Path(shutil.copytree(directory, tmp_path / "copy"))
     flip(copy, -1)
-    assert (scan(copy).run, verify(copy).files) == (Run.COMPLETE, Files.DAMAGED)
+    assert (scan(copy).run, verify(copy).files) == (RunOutcome.COMPLETE, Files.DAMAGED)
     with pytest.raises(SessionError, match="its run is complete; there is nothing to resume"):
         await asyncio.to_thread(interruption, copy)
     info = [event.data for event in Session.open(directory).events() if event.kind == "run.start"]
@@ -93,10 +93,10 @@ def test_a_killed_run_is_interrupted_and_once_salvaged_its_files_are_sound(
     daemon.kill()
     asyncio.run(end_laboratory(ordered))
     (directory,) = (tmp_path / "out").iterdir()
-    assert (scan(directory).run, verify(directory).files) == (Run.INTERRUPTED, Files.INCOMPLETE)
+    assert (scan(directory).run, verify(directory).files) == (RunOutcome.INTERRUPTED, Files.INCOMPLETE)
     salvage_session(directory)
     found = verify(directory)
-    assert (found.run, found.files) == (Run.INTERRUPTED, Files.SOUND), found.findings
+    assert (found.run, found.files) == (RunOutcome.INTERRUPTED, Files.SOUND), found.findings
     assert (scan(directory).run, scan(directory).files) == (found.run, found.files)
     assert all(hole.excused for hole in open_whole(directory).holes)
 
@@ -108,7 +108,7 @@ async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path
         await run_virtual(ordered, tmp_path / "out", None, break_sensor)
     await asyncio.gather(*tasks)
     (directory,) = (tmp_path / "out").iterdir()
-    assert (verify(directory).run, verify(directory).files) == (Run.TRIPPED, Files.SOUND)
+    assert (verify(directory).run, verify(directory).files) == (RunOutcome.TRIPPED, Files.SOUND)
     data = (directory / JOURNAL_NAME).read_bytes()
     entries = read_lines(data)[0]
     lines = data.splitlines(keepends=True)
@@ -118,7 +118,7 @@ async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path
     with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --clear"):
         await asyncio.to_thread(interruption, copy)
     flip(directory, -1, *(number for number, entry in enumerate(entries) if isinstance(entry, Tripped)))
-    assert (verify(directory).run, verify(directory).files) == (Run.TRIPPED, Files.DAMAGED)
+    assert (verify(directory).run, verify(directory).files) == (RunOutcome.TRIPPED, Files.DAMAGED)
     for _ in range(2):  # also when the last line has been cut off
         with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --clear"):
             await asyncio.to_thread(interruption, directory)

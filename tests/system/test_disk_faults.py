@@ -89,7 +89,7 @@ async def recorded(directory, order, start_ns, each_second):
     name, clock, hub = directory.name, VirtualClock(start_ns), Hub()
     info = SessionInfo(name, "demo", "DA1234567", "M. Adamczyk", "0.1.0", "virtual", simulated=True)
     devices = {"thermometers": "thermometers", "camera": "camera"}
-    recorder = Recorder(directory, info, order.attachments(), devices, hub, clock, SETTINGS)
+    recorder = Recorder(directory, info, order.attachments(), devices, hub, clock, settings=SETTINGS)
     recorder.start()
     journal = Journal.create(directory)
     journal.start(clock, print)

@@ -14,7 +14,7 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
 from thermostand.recording.reading.overview import overview
-from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.run import Interrupted, resume, run_virtual
@@ -83,7 +83,7 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
 
     session = Session.open(directory)
     found = verify(directory)
-    assert (found.run, found.files) == (Run.COMPLETE, Files.SOUND), found.findings
+    assert (found.run, found.files) == (RunOutcome.COMPLETE, Files.SOUND), found.findings
     assert session.attachments["recipe.yaml"] == NIGHT
     assert [event.data["change"] for event in session.events() if event.kind == "plan_changed"] == [
         "Skipped",

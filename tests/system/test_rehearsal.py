@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from thermostand.foundation.errors import ConfigError
-from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.run_word import RunOutcome
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import StandConfig, packaged
 from thermostand.stand.run import rehearsed, run_virtual
@@ -29,7 +29,7 @@ def real_stand(folder: Path, **changes: object) -> Path:
 async def test_the_rehearsal_of_a_real_stand_runs_and_is_recorded_as_simulated(tmp_path: Path):
     order = load_order(str(tmp_path / "short.yaml"), str(real_stand(tmp_path)))
     session = Session.open(await run_virtual(order, tmp_path / "out", 3, lambda hub: None))
-    assert (session.run, session.metadata["simulated"]) == (Run.COMPLETE, "true")
+    assert (session.run, session.metadata["simulated"]) == (RunOutcome.COMPLETE, "true")
     attached = StandConfig.model_validate(yaml.safe_load(session.attachments["config.yaml"]))
     assert attached.simulation is not None
     assert attached.limits.chamber_degC == (12, 48)

@@ -22,7 +22,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import StepState
 from thermostand.recording.format.messages import FRAME_META_CLASS
 from thermostand.recording.format.restarts import begins_of, is_superseded
-from thermostand.recording.reading.run_word import Files, Run
+from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.run import Interrupted, resume, run_virtual
@@ -96,7 +96,7 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
     session, plan = Session.open(directory), tuple(order.recipe.plan())
     assert (session.incomplete, session.damaged) == ((), ())
     found = verify(directory)
-    assert (found.run, found.files) == (Run.COMPLETE, Files.SOUND), found.findings
+    assert (found.run, found.files) == (RunOutcome.COMPLETE, Files.SOUND), found.findings
     assert (scan(directory).run, scan(directory).files) == (found.run, found.files)
     assert [hole for hole in session.holes if not hole.excused] == []
     done = Counter(mark.step_id for mark in session.steps() if mark.state is StepState.DONE)

@@ -18,7 +18,7 @@ from tests.system.test_run import fault
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepState
-from thermostand.recording.reading.run_word import Run
+from thermostand.recording.reading.run_word import RunOutcome
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.run import Interrupted, resume, run_virtual
@@ -58,7 +58,7 @@ async def test_a_chamber_that_is_away_comes_back(tmp_path: Path, set_point: floa
         at_the_end = session.readings(channel)[1][-1]
         assert at_the_end > laboratory_degC - 3.5
         assert channel.endswith("artifact") or at_the_end < laboratory_degC + 3.5
-    assert session.run is Run.COMPLETE
+    assert session.run is RunOutcome.COMPLETE
     assert session.readings("relays.heater_enable")[1][-1] == 0.0
     assert session.readings("relays.compressor")[1][-1] == 0.0
     assert session.readings("regulator.running")[1][-1] == 0.0
@@ -127,7 +127,7 @@ def test_a_stop_on_the_way_back_leaves_the_stand_safe_and_a_resume_goes_on_with_
     assert kinds.count("to_ambient") == 2
     assert kinds.index("at_ambient") > kinds.index("run.resume")
     session = Session.open(directory)
-    assert session.run is Run.COMPLETE
+    assert session.run is RunOutcome.COMPLETE
     done = Counter(mark.step_id for mark in session.steps() if mark.state is StepState.DONE)
     assert set(done.values()) == {1}
     assert session.readings("thermometers.air")[1][-1] == pytest.approx(18.0, abs=3.5)

@@ -19,7 +19,7 @@ from thermostand.foundation.output import output, say, show
 from thermostand.foundation.progress import late_progress
 from thermostand.foundation.usage import one_line, tell
 from thermostand.recording.exporting.archive import Rule, archive, delete, unfit
-from thermostand.recording.reading.catalogue import Entry
+from thermostand.recording.reading.catalogue import ListedSession
 from thermostand.stand.commands.reached import ConfigOption
 from thermostand.stand.commands.sessions.session_args import check_folder
 from thermostand.stand.commands.sessions.session_list_cli import sessions_at, user_name
@@ -94,10 +94,10 @@ def _line(text: str) -> None:
         typer.echo(one_line(text))
 
 
-def _to_copy(entries: Sequence[Entry], out: Path, found: _Done, *, again: bool) -> list[Entry]:
+def _to_copy(entries: Sequence[ListedSession], out: Path, found: _Done, *, again: bool) -> list[ListedSession]:
     """Those without a copy in `out`. Those that must wait are listed, and those whose copy is gone: a disk that is not
     mounted must not fill the one that its place is on."""
-    due: list[Entry] = []
+    due: list[ListedSession] = []
     for entry in entries:
         copy = (out / entry.name).resolve()
         if not entry.archived and (reason := unfit(entry)):
@@ -112,7 +112,7 @@ def _to_copy(entries: Sequence[Entry], out: Path, found: _Done, *, again: bool) 
     return due
 
 
-def _copy(entries: Sequence[Entry], out: Path, found: _Done, *, again: bool) -> None:
+def _copy(entries: Sequence[ListedSession], out: Path, found: _Done, *, again: bool) -> None:
     due = _to_copy(entries, out, found, again=again)
     if out.exists() and any(entry.path.stat().st_dev == out.stat().st_dev for entry in due):
         say(f"warning: {out}: is on the disk that the sessions are on")
@@ -137,7 +137,7 @@ def _copy(entries: Sequence[Entry], out: Path, found: _Done, *, again: bool) -> 
         _line(f"nothing to copy: {have} of {len(entries)} have a copy in {out}")
 
 
-def _delete(entries: Sequence[Entry], rule: Rule, found: _Done, *, yes: bool) -> None:
+def _delete(entries: Sequence[ListedSession], rule: Rule, found: _Done, *, yes: bool) -> None:
     """The rule and what it applies to; deleted only with `yes`."""
     _line(f"{rule}:")
     due = [entry for entry in entries if rule.applies(entry, WallClock().now_ns())]

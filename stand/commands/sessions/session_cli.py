@@ -27,7 +27,7 @@ from thermostand.recording.exporting.one_file import export_mcap
 from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format.damage import FileDamaged
-from thermostand.recording.format.inventory import State, inventory
+from thermostand.recording.format.inventory import SegmentState, inventory
 from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.scan import Scan, scan, verify
 from thermostand.recording.reading.session import Session, check_whole
@@ -76,7 +76,7 @@ def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
     becomes a sentence that says what helps."""
     files = inventory(check_session(directory))
     help_text = f"`stand session salvage {directory}`"
-    growing = [file.name for file in files if file.state is State.RECORDING]
+    growing = [file.name for file in files if file.state is SegmentState.RECORDING]
     if growing:
         _warn(f"{directory}: is being recorded; left out because they are not finished yet: {', '.join(growing)}")
     try:
@@ -99,7 +99,7 @@ def verify_session(directory: SessionArgument) -> None:
     Example: stand session verify sessions/20260101T180000Z-thermal-cycle
     """
     files = inventory(check_session(directory))
-    total_bytes = sum(file.size_bytes for file in files if file.state is State.FINISHED)
+    total_bytes = sum(file.size_bytes for file in files if file.state is SegmentState.FINISHED)
     with late_progress("verify", total_bytes) as report:
         found = verify(directory, report)
     show(verify_json(found), verify_lines(found))

@@ -18,7 +18,7 @@ from thermostand.foundation.command_app import App
 from thermostand.foundation.output import output, say, show
 from thermostand.foundation.usage import one_line
 from thermostand.recording.format.inventory import inventory
-from thermostand.recording.reading.catalogue import Entry, Report, catalogue, look_at
+from thermostand.recording.reading.catalogue import ListedSession, Report, catalogue, look_at
 from thermostand.recording.reading.notes import add_note, add_tags, check_tag, read_notes
 from thermostand.stand.commands.sessions.session_args import SessionArgument, check_folder, check_session
 from thermostand.stand.commands.sessions.session_table import ON_THE_RIGHT, entry_json, fitting, lines, rows
@@ -54,7 +54,7 @@ def list_sessions(
         typer.echo("\n".join(lines(*rows(seen))))
 
 
-def sessions_at(directory: Path) -> list[Entry]:
+def sessions_at(directory: Path) -> list[ListedSession]:
     """`directory` itself when it is a session, else those in it."""
     if inventory(directory):
         return [look_at(directory)]
@@ -69,7 +69,7 @@ def sessions_at(directory: Path) -> list[Entry]:
         return catalogue(directory, progress)
 
 
-def _show_table(seen: list[Entry]) -> None:
+def _show_table(seen: list[ListedSession]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from thermostand.foundation.instants import date_time, duration, utc_text
 from thermostand.foundation.usage import one_line
-from thermostand.recording.reading.catalogue import Entry
+from thermostand.recording.reading.catalogue import ListedSession
 
 COLUMNS = ("session", "recipe", "start (local)", "duration", "frames", "size", "devices", "run", "files")
 ON_THE_RIGHT = frozenset({"duration", "frames", "size"})
@@ -25,7 +25,7 @@ def size(size_bytes: int) -> str:
     return f"{size_bytes} B"
 
 
-def rows(entries: Sequence[Entry]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def rows(entries: Sequence[ListedSession]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """The columns and a row for each session. Columns of tags, copies and notes are there when any session has one."""
     has_copies = any(entry.copies for entry in entries)
     optional = {
@@ -38,7 +38,7 @@ def rows(entries: Sequence[Entry]) -> tuple[tuple[str, ...], list[tuple[str, ...
     return columns, [(*_row(entry), *(cells[place] for cells in shown.values())) for place, entry in enumerate(entries)]
 
 
-def _row(entry: Entry) -> tuple[str, ...]:
+def _row(entry: ListedSession) -> tuple[str, ...]:
     length = "" if entry.begin_ns is None or entry.end_ns is None else duration(entry.end_ns - entry.begin_ns)
     return (
         one_line(entry.name),
@@ -53,7 +53,7 @@ def _row(entry: Entry) -> tuple[str, ...]:
     )
 
 
-def _last_note(entry: Entry) -> str:
+def _last_note(entry: ListedSession) -> str:
     if not entry.notes:
         return ""
     text = one_line(entry.notes[-1].text)
@@ -82,7 +82,7 @@ def lines(columns: tuple[str, ...], table: Sequence[tuple[str, ...]]) -> Iterato
         yield "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
 
 
-def entry_json(entry: Entry) -> dict[str, object]:
+def entry_json(entry: ListedSession) -> dict[str, object]:
     """One session of `stand session list --json`, the head of `info --json`. start and end are UTC, what ends in _ns is
     an instant of the stand's clock but for that of a note or copy, which is UTC, and durations are differences."""
     has_times = entry.begin_ns is not None and entry.end_ns is not None

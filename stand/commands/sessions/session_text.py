@@ -11,9 +11,9 @@ from dataclasses import asdict, replace
 from thermostand.foundation.instants import duration, local_text
 from thermostand.foundation.items import Event, StepState
 from thermostand.foundation.usage import one_line
-from thermostand.recording.format.inventory import State
+from thermostand.recording.format.inventory import SegmentState
 from thermostand.recording.format.utc_offsets import UtcOffsets
-from thermostand.recording.reading.catalogue import Entry, entry_of
+from thermostand.recording.reading.catalogue import ListedSession, entry_of
 from thermostand.recording.reading.overview import FramesSummary, Overview, RunStep, TemperatureRange
 from thermostand.recording.reading.run_word import Files
 from thermostand.recording.reading.scan import Scan
@@ -40,7 +40,7 @@ def info_lines(found: Overview) -> Iterator[str]:
         yield from part
 
 
-def _entry(found: Overview) -> Entry:
+def _entry(found: Overview) -> ListedSession:
     """As the list has it, with the steps of the system clock in between."""
     seen, utc = found.scanned, found.scanned.utc
     start_ns = None if seen.begin_ns is None else utc.utc_ns(seen.begin_ns)
@@ -87,11 +87,11 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
         yield from _row("damaged", trouble)
     for text in _limited(seen.sentences(Files.INCOMPLETE)):
         yield from _row("missing", text)
-    if found.scanned.sentences(Files.DAMAGED) or seen.count(State.UNFINISHED):
+    if found.scanned.sentences(Files.DAMAGED) or seen.count(SegmentState.UNFINISHED):
         yield from _row("to do", f"stand session salvage {seen.path}")
 
 
-def _said(entry: Entry) -> Iterator[str]:
+def _said(entry: ListedSession) -> Iterator[str]:
     """What people said of the session, and where a copy is."""
     if entry.tags:
         yield from _row("tags", ", ".join(entry.tags))
@@ -103,13 +103,13 @@ def _said(entry: Entry) -> Iterator[str]:
 def _segments(seen: Scan) -> str:
     by_series: dict[str, list[int]] = {}
     for file in seen.inventory:
-        if file.state is State.FINISHED:
+        if file.state is SegmentState.FINISHED:
             by_series.setdefault(file.series, []).append(file.size_bytes)
     parts = [f"{series} {len(sizes)} ({size(sum(sizes))})" for series, sizes in by_series.items()]
     others = [
         f"{file.name} is {file.state} ({size(file.size_bytes)})"
         for file in seen.inventory
-        if file.state is not State.FINISHED
+        if file.state is not SegmentState.FINISHED
     ]
     return "; ".join([", ".join(parts) or "none finished", *_limited(others)])
 

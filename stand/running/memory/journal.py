@@ -32,7 +32,7 @@ from thermostand.recording.format.journal_lines import (
     mark_of,
 )
 from thermostand.recording.format.layout import TELEMETRY
-from thermostand.recording.writing.disk import JOURNAL_LINE, Disk
+from thermostand.recording.writing.disk import JOURNAL_LINE, DiskProcess
 from thermostand.recording.writing.home import FolderLost
 from thermostand.recording.writing.locks import lock
 from thermostand.stand.fault import Fault
@@ -61,7 +61,7 @@ class Journal:
         self.lost = ""
         self._file: JournalFile | None = JournalFile(path, fd, len(data))
         self._line: Line | None = None  # to the disk process, when that has the file
-        self._disk: Disk | None = None
+        self._disk: DiskProcess | None = None
         self._acknowledged = bytearray(data)
         self._end = len(data)  # of all lines, those that wait too
         self._waiting: list[bytes] = []
@@ -114,7 +114,7 @@ class Journal:
             raise
         return cls(path, fd, data, mark, damage), entries
 
-    def start(self, clock: Clock, trouble: Callable[[str], None], disk: Disk | None = None) -> None:
+    def start(self, clock: Clock, trouble: Callable[[str], None], disk: DiskProcess | None = None) -> None:
         """Before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence, `disk` is the
         process that has the file from then on."""
         self._lane = Lane("journal", clock, patient=False)
@@ -331,7 +331,7 @@ class Logbook:
         self._clock = clock
         self._journal: Journal | None = None
 
-    async def begin(self, journal: Journal, *entries: Written, disk: Disk | None = None) -> None:
+    async def begin(self, journal: Journal, *entries: Written, disk: DiskProcess | None = None) -> None:
         """The journal's first entries of this run, on the disk when this returns; `disk` writes it."""
         self._journal = journal
         journal.start(self._clock, lambda text: self.tell(JOURNAL_NOT_SAVED, text), disk)

@@ -18,7 +18,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.repeats import RepeatLimit
 from thermostand.foundation.tasks import cancelled, watched
-from thermostand.recording.writing.disk import FILES_LINE, LATCH_LINE, Disk
+from thermostand.recording.writing.disk import FILES_LINE, LATCH_LINE, DiskProcess
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.fault import Fault
@@ -38,7 +38,7 @@ Time = Callable[[], Coroutine[None, None, None]]
 Result = TypeVar("Result")
 
 
-class Recorder(Recording, Protocol):
+class RunRecorder(Recording, Protocol):
     """Of what is recorded now, by a run or between runs."""
 
     def refound(self) -> None:
@@ -71,14 +71,14 @@ class OpenStand:
     when the last guest has left and the stand is safe.
     """
 
-    def __init__(self, assembly: Assembly, disk: Disk | None, patience: Patience, *, is_for_one: bool) -> None:
+    def __init__(self, assembly: Assembly, disk: DiskProcess | None, patience: Patience, *, is_for_one: bool) -> None:
         self.assembly = assembly
         self.latch = assembly.stand.latch
         self.disk = disk
         self.patience = patience
         self.is_for_one = is_for_one
         self.background: list[asyncio.Task[None]] = []
-        self.recorder: Recorder | None = None
+        self.recorder: RunRecorder | None = None
         self.guest: Guest | None = None
         self._announced = Announcements()
         self._guard: Guard | None = None
@@ -257,7 +257,7 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
     Raises what opening raises; what answered until then was made safe.
     """
     async with AsyncExitStack() as stack:
-        disk = None if isinstance(assembly.clock, VirtualClock) else Disk()
+        disk = None if isinstance(assembly.clock, VirtualClock) else DiskProcess()
         latch = None
         if disk is not None:
             latch = await asyncio.to_thread(latch_file, assembly.config)

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.inventory import inventory
-from thermostand.recording.reading.catalogue import Entry, Memory, catalogue, look_at
+from thermostand.recording.reading.catalogue import ListedSession, Memory, catalogue, look_at
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
@@ -147,7 +147,7 @@ def _sessions(folder: Path, memory: Memory) -> list[SessionEntry]:
         return []
 
 
-def _entry(seen: Entry) -> SessionEntry:
+def _entry(seen: ListedSession) -> SessionEntry:
     return SessionEntry(
         name=seen.name.encode("utf-8", "replace").decode(),
         recipe=seen.metadata.get("recipe", ""),
