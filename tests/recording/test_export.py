@@ -302,11 +302,7 @@ import sys
 sys.modules["pyarrow"] = None  # as an interpreter that has none
 from pathlib import Path
 from thermostand.recording.exporting.export import export
-from thermostand.recording.writing.segment import Record, SeriesForm, Topic
-from thermostand.recording.writing.series import Series
-from thermostand.recording.reading.notes import add_note, add_tags
 from thermostand.recording.reading.session import Session
-from thermostand.recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
 export(Session.open(Path(sys.argv[1])), Path(sys.argv[2]), telemetry="parquet", report=print)
 """
 
