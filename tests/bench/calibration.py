@@ -15,8 +15,17 @@ from numpy.typing import NDArray
 
 from tests.bench import mrcal_peer
 from tests.bench.figures import Figure, at_most, in_turns, milliseconds, progress, side_by_side
-from tests.compensation.calibration_cases import CENTRE_mm, board, positions, translation_errors_um
-from tests.compensation.calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw
+from tests.compensation.calibration_truth import (
+    SIZE,
+    CENTRE_mm,
+    Laboratory,
+    TrueCamera,
+    Truth,
+    board,
+    draw,
+    positions,
+    translation_errors_um,
+)
 from thermostand.compensation.calibration.adjustment import Adjustment, adjust, table_from_poses
 from thermostand.compensation.calibration.board import Board, shifts_by_homography
 from thermostand.compensation.calibration.calibrate import halves, rays_of

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tests.bench.figures import Figure, progress, side_by_side, skipped
-from tests.compensation.calibration_cases import CENTRE_mm, board, positions, translation_errors_um
-from tests.compensation.calibration_truth import SIZE, Truth, draw
+from tests.compensation.calibration_truth import SIZE, CENTRE_mm, Truth, board, draw, positions, translation_errors_um
 from thermostand.compensation.calibration.adjustment import adjust, table_from_poses
 from thermostand.compensation.calibration.board import shifts_by_homography
 from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv

@@ -15,8 +15,7 @@ from thermostand.compensation.calibration.rays import fit_rays
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.foundation.errors import CalibrationError
 
-from .calibration_cases import board, positions
-from .calibration_truth import SIZE, TrueCamera, Truth, draw, ellipse_centres
+from .calibration_truth import SIZE, TrueCamera, Truth, board, draw, ellipse_centres, positions
 
 BROWN = Pinhole(np.array([7246.0, 7251, 1231.8, 1015.4, -0.12, 0.35, 2e-4, -3e-4, 0.7]), SIZE)
 RATIONAL = Pinhole(np.concatenate([BROWN.vector, [0.05, -0.2, 0.4]]), SIZE)

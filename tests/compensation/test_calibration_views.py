@@ -25,8 +25,7 @@ from thermostand.compensation.calibration.views import (
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import CalibrationError
 
-from .calibration_cases import board
-from .calibration_truth import SIZE, Laboratory, TrueCamera, Truth, draw
+from .calibration_truth import SIZE, Laboratory, TrueCamera, Truth, board, draw
 from .rendered import photograph, render
 from .test_markers import HALF
 

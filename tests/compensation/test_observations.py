@@ -5,24 +5,36 @@ from __future__ import annotations
 import asyncio
 import re
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from thermostand.compensation.cli import app
 from thermostand.compensation.drift.displacements import displacements, reference_centres
-from thermostand.compensation.observations import Observations, concatenate, observe_session, session_target
+from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.model_file import save_model
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, exponents
+from thermostand.compensation.history.thermal_history import recorded_history
+from thermostand.compensation.observations import Observations, concatenate, observe, observe_session, session_target
+from thermostand.compensation.one_camera import name_of, own_frames, take
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.instants import local_text
+from thermostand.foundation.items import Batch, Item
+from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.detection import Flag
 from thermostand.recording.format.records import frame_places
 from thermostand.recording.format.restarts import restarted
 from thermostand.recording.reading.session import Session
+from thermostand.recording.repair.salvage import salvage_session
 
-from .conftest import DARK, GLARE, SEQUENCE, START_NS, TARGET_YAML, Recorded, record
+from .conftest import DARK, GLARE, SEQUENCE, STAND, START_NS, TARGET_YAML, Recorded, published, record, record_items
+from .made_up_models import paper
 from .synthetic import facts, observations, quadratic
 
 
@@ -178,3 +190,188 @@ def test_missing_markers_are_left_out_one_by_one():
     rows = displacements(replace(some, centres_px=centres), some.of(Role.FIT))
     assert len(rows.frame) == 14 * 53 - 1
     assert 4 not in rows.marker
+
+
+# A session of which segments are missing is fitted, reported and applied only when that is asked for.
+
+
+runner = CliRunner()
+
+
+@pytest.fixture
+def holed(recorded: Recorded, tmp_path: Path) -> Path:
+    """The second segment of the frames, ten minutes of the night, is missing."""
+    path = Path(shutil.copytree(recorded.path, tmp_path / "night"))
+    assert len(list((path / "frames").glob("*.mcap"))) == 2
+    (path / "frames" / "0000.mcap").unlink()
+    return path
+
+
+def ask(*arguments: object) -> tuple[int, str]:
+    result = runner.invoke(app, [str(argument) for argument in arguments])
+    return result.exit_code, " ".join(result.stderr.split())
+
+
+def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path, tmp_path: Path):
+    out = tmp_path / "markers.csv"
+    status, said = ask("detect", holed, "-o", out)
+    assert status == 1
+    assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in said
+    assert said.endswith("; use --incomplete to read the rest")
+    assert not out.exists()
+    status, said = ask("detect", holed, "-o", out, "--incomplete")
+    assert status == 0
+    assert f"warning: {holed}: is incomplete; missing: frames/0000.mcap" in said
+    assert 0 < len({line.split(",")[0] for line in out.read_text().splitlines()[1:]}) < len(SEQUENCE)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("fit", "{session}", "-o", "{out}"),
+        ("report", "{session}", "-o", "{out}"),
+        ("budget", "{session}"),
+        ("calibrate", "{session}", "-o", "{out}"),
+    ],
+)
+def test_each_command_refuses_it_with_the_same_sentence(holed: Path, tmp_path: Path, command: tuple[str, ...]):
+    out = tmp_path / "out.html"
+    status, said = ask(*(text.format(session=holed, out=out) for text in command))
+    assert status == 1
+    assert said.startswith(f"error: {holed}: is incomplete; missing: frames/0000.mcap (to ")
+    assert said.endswith("use --incomplete to read the rest")
+    assert not out.exists()
+    _, said = ask(*(text.format(session=holed, out=out) for text in command), "--incomplete")
+    assert said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap (to ")
+
+
+def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded, tmp_path: Path):
+    model, points = tmp_path / "model.json", tmp_path / "points.csv"
+    save_model(paper(), model)
+    time_ns = Session.open(recorded.path).frame_times_ns[-1]
+    points.write_text(f"x_px,y_px,time_ns\n320,240,{time_ns}\n")
+    for source in ((holed,), (points, "--session", holed)):
+        out = tmp_path / "out"
+        status, said = ask("apply", model, *source, "-o", out)
+        assert status == 1
+        assert said.endswith("use --incomplete to read the rest")
+        assert not out.exists()
+    status, said = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")
+    assert (status, said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap")) == (0, True)
+
+
+@pytest.fixture
+def unfinished(recorded: Recorded, tmp_path: Path) -> Path:
+    """A killed recorder has left the second segment of the frames."""
+    path = Path(shutil.copytree(recorded.path, tmp_path / "night"))
+    last = path / "frames" / "0001.mcap"
+    last.rename(last.with_name("0001.mcap.part"))
+    return path
+
+
+def test_what_a_killed_recorder_left_is_not_left_out_in_silence(unfinished: Path, tmp_path: Path):
+    out = tmp_path / "markers.csv"
+    status, said = ask("detect", unfinished, "-o", out)
+    assert status == 1
+    assert said == (
+        f"error: {unfinished}: frames/0001.mcap.part is not finished and would be left out; "
+        f"`stand session salvage {unfinished}` first"
+    )
+    assert not out.exists()
+    status, said = ask("detect", unfinished, "-o", out, "--incomplete")
+    assert status == 0
+    assert f"warning: {unfinished}: frames/0001.mcap.part is not finished and left out" in said
+    salvage_session(unfinished)
+    status, said = ask("detect", unfinished, "-o", out)
+    assert (status, "warning" in said) == (0, False)
+
+
+# Of a session of several cameras each has observations, temperatures and a serial number of its own.
+
+
+FRAMES, APART_NS, WARMER_K = 3, 1_000_000, 7.0
+
+
+def of_both(index: int, time_ns: int) -> Iterator[Item]:
+    for item in published(index, time_ns):
+        yield item
+        if isinstance(item, Frame):
+            later_ns = time_ns + APART_NS
+            warmer = {"channel": "side.image", "time_ns": later_ns, "camera_degC": item.camera_degC + WARMER_K}
+            yield replace(item, **warmer)
+            for name, degC in (("camera", item.camera_degC), ("side", item.camera_degC + WARMER_K)):
+                yield Batch(name, later_ns, (Reading(f"{name}.temperature", degC, "degC", later_ns),))
+
+
+@pytest.fixture(scope="module")
+def two_cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("several") / "night"
+    devices = {**STAND, "side": "camera"}
+    asyncio.run(record_items(path, of_both, FRAMES, 60, devices=devices, serials="TS-0001, TS-0002"))
+    return path
+
+
+def test_each_camera_of_a_session_is_observed_by_its_name(two_cameras: Path):
+    path = two_cameras
+    leading, side = observe(path), observe(path, camera="side")
+    assert (side.time_ns - leading.time_ns).tolist() == [APART_NS] * FRAMES
+    assert (side.camera_degC - leading.camera_degC).tolist() == pytest.approx([WARMER_K] * FRAMES)
+    assert [each.sessions[0].camera_serial for each in (leading, side)] == ["TS-0001", "TS-0002"]
+    session = Session.open(path)
+    take(session, "side")
+    assert recorded_history(session).camera_degC[0] == pytest.approx(leading.camera_degC[0] + WARMER_K, abs=0.5)
+    with pytest.raises(SessionError, match="no frames of a camera top; it has those of camera, side"):
+        observe(path, camera="top")
+    assert own_frames(session) == [1, 3, 5]
+    assert (name_of(session, "TS-0002"), name_of(session, "TS-0009")) == ("side", None)
+    for command in (["apply", str(model_of(path.parent, "TS-0009"))], ["budget"], ["calibrate"]):
+        out = [] if command == ["budget"] else ["-o", str(path.parent / "out")]
+        result = CliRunner().invoke(app, [*command, str(path), "--camera", "top", *out])
+        assert "no frames of a camera top" in result.output
+
+
+def model_of(folder: Path, serial: str) -> Path:
+    count = len(exponents(1))
+    facts = ModelFacts(
+        image_size=(640, 480),
+        hull_px=np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]]),
+        reference_degC=44.0,
+        reference_chamber_degC=24.0,
+        reference_centres_px=np.array([[10.0, 9.0]]),
+        target_name="small",
+        camera_serial=serial,
+        session_ids=("night",),
+        software_version="0",
+        camera_range_degC=(0.0, 90.0),
+    )
+    score = DegreeScore(degree=1, terms=count, condition=9.0, rms_px=(0.1, 0.1), fold_chamber_degC=(), fold_rms_px=())
+    still, sure = np.zeros((2, count)), np.array([1e-6 * np.eye(count)] * 2)
+    model = PaperModel(
+        facts=facts,
+        degree=1,
+        coefficients=still,
+        coefficient_covariance=sure,
+        discrepancy_px=np.array([0.02, 0.03]),
+        scores=(score,),
+        candidates=(),
+    )
+    path = folder / f"{serial}.json"
+    save_model(model, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("serial", "options", "camera_degC"),
+    [("TS-0002", (), 7.0), ("TS-0001", ("--camera", "side"), 7.0), ("TS-0001", (), 0.0)],
+)
+def test_a_model_corrects_the_frames_of_its_own_camera_or_the_one_named(
+    two_cameras: Path, tmp_path: Path, serial: str, options: tuple[str, ...], camera_degC: float
+):
+    out = tmp_path / "out"
+    result = CliRunner().invoke(
+        app, ["apply", str(model_of(tmp_path, serial)), str(two_cameras), "-o", str(out), *options]
+    )
+    assert result.exit_code == 0, result.output
+    rows = (out / "images.csv").read_text().splitlines()[1:]
+    leading = observe(two_cameras).camera_degC
+    assert [float(row.split(",")[3]) for row in rows] == pytest.approx((leading + camera_degC).tolist(), abs=1e-3)

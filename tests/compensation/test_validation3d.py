@@ -34,8 +34,7 @@ from thermostand.compensation.validation3d.validate import (
 )
 from thermostand.foundation.errors import CalibrationError, SessionError
 
-from .calibration_cases import board, positions, target_of
-from .calibration_truth import SIZE, Laboratory, Truth, draw
+from .calibration_truth import SIZE, Laboratory, Truth, board, draw, positions, target_of
 from .synthetic import observations as thermal_cycle
 from .validation3d_truth import POSITIONS, Moved, validation_session
 
