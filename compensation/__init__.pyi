@@ -6,10 +6,10 @@ from thermostand.compensation.calibration.calibrate import calibrate as calibrat
 from thermostand.compensation.calibration.camera_file import CameraFile as CameraFile
 from thermostand.compensation.calibration.camera_file import load_camera as load_camera
 from thermostand.compensation.calibration.session_centres import Positions as Positions
+from thermostand.compensation.calibration.session_centres import Views as Views
 from thermostand.compensation.calibration.session_centres import observe_positions as observe_positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma as TableSigma
 from thermostand.compensation.calibration.views import ViewCalibration as ViewCalibration
-from thermostand.compensation.calibration.views import Views as Views
 from thermostand.compensation.calibration.views import calibrate_views as calibrate_views
 from thermostand.compensation.drift.anchoring import anchored as anchored
 from thermostand.compensation.drift.anchoring import fit_like as fit_like

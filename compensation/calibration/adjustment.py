@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +20,8 @@ from thermostand.compensation.calibration.least_squares import (
     next_discrepancy,
     whiteners,
 )
-from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv
-from thermostand.compensation.calibration.session_centres import Positions
+from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv, seen_points
+from thermostand.compensation.calibration.session_centres import Positions, Views
 from thermostand.compensation.calibration.stage_geometry import ERRORS, PARAMETERS, TableGeometry, TableSigma
 from thermostand.compensation.drift.hull import convex_hull
 from thermostand.foundation.errors import CalibrationError
@@ -100,71 +102,127 @@ class TableScene:
     points_mm: Float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """The whitened problem: M used markers, at position[m] with board point marker[m]."""
-
-    position: NDArray[np.int64]
-    marker: NDArray[np.int64]
-    linear_mm: Float
-    rotary_deg: Float
-    centres_px: Float
-    whitener: Float
-    prior_mm: Float
-    sigma_mm: Float
-    freed: NDArray[np.bool_]
-    errors_sigma: Float
-    lens_sigma: Float
+class Scene(Protocol):
+    """What is looked for, whatever holds the board: a camera and board points (N, 3), mm, among others."""
 
     @property
-    def count(self) -> int:
-        """How many residuals there are, those of the priors included."""
-        errors = int(self.freed.sum()) * len(self.linear_mm)
-        return 2 * len(self.position) + len(self.lens_sigma) + errors + self.prior_mm.size
+    def lens(self) -> Pinhole:
+        """The camera."""
+        ...
 
-    def residuals(self, scene: TableScene) -> Float:
-        """(count,): markers (x, y each), distortion, table errors, board; all of unit variance."""
-        seen = _seen_points(scene, self)
-        off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(seen) - self.centres_px)
-        return np.concatenate(
-            [
-                off.ravel(),
-                scene.lens.distortion / self.lens_sigma,
-                (scene.errors / self.errors_sigma)[:, self.freed].ravel(),
-                ((scene.points_mm - self.prior_mm) / self.sigma_mm).ravel(),
-            ]
-        )
+    @property
+    def points_mm(self) -> Float:
+        """(N, 3)."""
+        ...
+
+
+Sought = TypeVar("Sought", bound=Scene)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem(ABC, Generic[Sought]):
+    """The whitened problem: M used markers, of board point marker[m] in picture[m] of so many, with priors of the
+    distortion and the board. What pictures have of their own, and where the board is in them, subclasses say."""
+
+    pictures: int
+    picture: NDArray[np.int64]
+    marker: NDArray[np.int64]
+    centres_px: Float
+    whitener: Float
+    board: Board
+    lens_sigma: Float
+
+    @abstractmethod
+    def seen_points(self, scene: Sought) -> Float:
+        """(M, 3): the used markers in the camera's frame, mm."""
+
+    @abstractmethod
+    def slopes(self, scene: Sought) -> Slopes:
+        """Derivatives of the markers' residuals."""
+
+    @abstractmethod
+    def stepped(self, scene: Sought, change: Float) -> Sought:
+        """The scene a step (n,) away."""
+
+    def own_priors(self, scene: Sought) -> tuple[Float, Float]:
+        """Residuals (K,) of what is known beforehand of the pictures' own, and their weights (K,); none."""
+        return np.empty(0), np.empty(0)
+
+    def residuals(self, scene: Sought) -> Float:
+        """Markers (x, y each), distortion, the pictures' own, board; all of unit variance."""
+        off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(self.seen_points(scene)) - self.centres_px)
+        board = (scene.points_mm - self.board.points_mm) / self.board.sigma_mm
+        own, _ = self.own_priors(scene)
+        return np.concatenate([off.ravel(), scene.lens.distortion / self.lens_sigma, own, board.ravel()])
+
+    def equations(self, scene: Sought, residuals: Float) -> tuple[Float, Float]:
+        """Normal matrix (n, n) and gradient (n,) of a step of camera, what pictures have of their own, and board."""
+        off = residuals[: 2 * len(self.picture)].reshape(-1, 2)
+        normal, gradient = equations_of(self.slopes(scene), off, self.pictures, len(self.board.points_mm))
+        _, own = self.own_priors(scene)
+        weights = np.concatenate([1 / self.lens_sigma, own, 1 / self.board.sigma_mm.ravel()])
+        lens, count, others = len(scene.lens.vector), len(normal), len(weights) - len(self.lens_sigma)
+        known = np.concatenate([np.arange(lens - len(self.lens_sigma), lens), np.arange(count - others, count)])
+        normal[known, known] += weights**2
+        gradient[known] += weights * residuals[off.size :]
+        return normal, gradient
+
+
+def whitened(
+    views: Views, board: Board, *, lens: Pinhole, shifts_px: Float, used: NDArray[np.bool_], discrepancy_px: float
+) -> dict[str, Any]:
+    """The fields that all problems have, of the markers `used` (P, N), their ellipses' centres moved by -shifts_px
+    (P, N, 2) to the discs'."""
+    picture, marker = np.nonzero(used)
+    return {
+        "pictures": len(used),
+        "picture": picture,
+        "marker": marker,
+        "centres_px": (views.centres_px - shifts_px)[used],
+        "whitener": whiteners(views.covariance_px2[used] + discrepancy_px**2 * np.eye(2)),
+        "board": board,
+        "lens_sigma": lens_sigma(lens),
+    }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableProblem(Problem[TableScene]):
+    """The table holds the board, at positions (P,); freed (6,): of its errors, with sigmas (6,)."""
+
+    linear_mm: Float
+    rotary_deg: Float
+    freed: NDArray[np.bool_]
+    errors_sigma: Float
+
+    def own_priors(self, scene: TableScene) -> tuple[Float, Float]:
+        """Of the table's free errors."""
+        own = (scene.errors / self.errors_sigma)[:, self.freed].ravel()
+        return own, np.tile(1 / self.errors_sigma[self.freed], len(scene.errors))
+
+    def seen_points(self, scene: TableScene) -> Float:
+        """(M, 3): the used markers in the camera's frame, mm."""
+        rotations, translations = scene.table.poses(self.linear_mm, self.rotary_deg, scene.errors)
+        turned = np.einsum("mij,mj->mi", rotations[self.picture], scene.points_mm[self.marker])
+        return turned + translations[self.picture]
 
     def slopes(self, scene: TableScene) -> Slopes:
         """Derivatives of the markers' residuals."""
         points = scene.points_mm[self.marker]
-        seen = _seen_points(scene, self)
-        linear, rotary = self.linear_mm[self.position], self.rotary_deg[self.position]
-        to_table, to_errors, to_points = scene.table.jacobian(points, linear, rotary, scene.errors[self.position])
+        seen = self.seen_points(scene)
+        linear, rotary = self.linear_mm[self.picture], self.rotary_deg[self.picture]
+        to_table, to_errors, to_points = scene.table.jacobian(points, linear, rotary, scene.errors[self.picture])
         by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
         by_lens = self.whitener @ scene.lens.vector_jacobian(seen)
         return Slopes(
-            self.position,
+            self.picture,
             self.marker,
             np.concatenate([by_lens, by_point @ to_table], axis=2),
             by_point @ to_errors[:, :, self.freed],
             by_point @ to_points,
         )
 
-    def equations(self, scene: TableScene, residuals: Float) -> tuple[Float, Float]:
-        """Normal matrix (n, n) and gradient (n,) of a step of camera, table, free table errors and board points."""
-        off = residuals[: 2 * len(self.position)].reshape(-1, 2)
-        normal, gradient = equations_of(self.slopes(scene), off, len(self.linear_mm), len(self.prior_mm))
-        errors = np.tile(1 / self.errors_sigma[self.freed], len(scene.errors))
-        weights = np.concatenate([1 / self.lens_sigma, errors, 1 / self.sigma_mm.ravel()])
-        lens, others = len(scene.lens.vector), len(weights) - len(self.lens_sigma)
-        known = np.concatenate([np.arange(4, lens), np.arange(len(normal) - others, len(normal))])
-        normal[known, known] += weights**2
-        gradient[known] += weights * residuals[off.size :]
-        return normal, gradient
-
     def stepped(self, scene: TableScene, change: Float) -> TableScene:
-        """The scene a step (n,) away."""
+        """The scene a step (n,) of camera, table, free table errors and board points away."""
         lens, free = len(scene.lens.vector), int(self.freed.sum())
         first_point = len(change) - scene.points_mm.size
         errors = scene.errors.copy()
@@ -177,42 +235,16 @@ class Problem:
         )
 
 
-def problem_of(
-    positions: Positions,
-    board: Board,
-    sigma: TableSigma,
-    *,
-    lens: Pinhole,
-    shifts_px: Float,
-    used: NDArray[np.bool_],
-    discrepancy_px: float,
-) -> Problem:
-    """The problem of the markers `used` (P, N), their ellipses' centres moved by -shifts_px (P, N, 2) to the discs'."""
-    position, marker = np.nonzero(used)
-    covariance = positions.covariance_px2[used] + discrepancy_px**2 * np.eye(2)
-    sigma_vector = sigma.vector
-    freed = sigma_vector > 0
-    return Problem(
-        position=position,
-        marker=marker,
+def table_problem(positions: Positions, board: Board, sigma: TableSigma, **chosen: Any) -> TableProblem:
+    """chosen: as `whitened` takes it."""
+    freed = sigma.vector > 0
+    return TableProblem(
+        **whitened(positions, board, **chosen),
         linear_mm=positions.linear_mm,
         rotary_deg=positions.rotary_deg,
-        centres_px=(positions.centres_px - shifts_px)[used],
-        whitener=whiteners(covariance),
-        prior_mm=board.points_mm,
-        sigma_mm=board.sigma_mm,
         freed=freed,
-        errors_sigma=np.where(freed, sigma_vector, 1.0),
-        lens_sigma=lens_sigma(lens),
+        errors_sigma=np.where(freed, sigma.vector, 1.0),
     )
-
-
-def _seen_points(scene: TableScene, problem: Problem) -> Float:
-    """(M, 3): the used markers in the camera's frame, mm."""
-    rotations, translations = scene.table.poses(problem.linear_mm, problem.rotary_deg, scene.errors)
-    points = scene.points_mm[problem.marker]
-    turned = np.einsum("mij,mj->mi", rotations[problem.position], points)
-    return turned + translations[problem.position]
 
 
 def lens_sigma(lens: Pinhole) -> Float:
@@ -407,11 +439,10 @@ def _adjusted(
     used: NDArray[np.bool_],
     discrepancy_px: float,
 ) -> _Round:
-    problem = problem_of(
-        positions, board, sigma, lens=start.lens, shifts_px=shifts_px, used=used, discrepancy_px=discrepancy_px
-    )
+    chosen = {"shifts_px": shifts_px, "used": used, "discrepancy_px": discrepancy_px}
+    problem = table_problem(positions, board, sigma, lens=start.lens, **chosen)
     solution = minimise(start, problem.residuals, problem.equations, problem.stepped)
-    degrees = problem.count - len(solution.covariance)
+    degrees = len(problem.residuals(solution.state)) - len(solution.covariance)
     chi2 = solution.cost / degrees
     excess = max(chi2, _board_excess(solution, board))
     residuals = _residuals(solution.state, positions, shifts_px)
@@ -456,7 +487,7 @@ def start_of(positions: Positions, board: Board) -> Start:
 def _residuals(scene: TableScene, positions: Positions, shifts_px: Float) -> Float:
     """(P, N, 2): computed minus measured centres, px; NaN without a centre."""
     rotations, translations = scene.table.poses(positions.linear_mm, positions.rotary_deg, scene.errors)
-    seen = np.einsum("pij,nj->pni", rotations, scene.points_mm) + translations[:, None]
+    seen = seen_points(rotations, translations, scene.points_mm)
     return scene.lens.project(seen) - (positions.centres_px - shifts_px)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from thermostand.compensation.calibration.adjustment import Adjustment, adjust, start_of
 from thermostand.compensation.calibration.board import Board, board_of
 from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.pinhole import seen_points
 from thermostand.compensation.calibration.pose import Lens, find_pose
 from thermostand.compensation.calibration.rays import DEGREES, RayLens, fit_rays
 from thermostand.compensation.calibration.session_centres import Positions
@@ -73,7 +74,7 @@ def _used(adjustment: Adjustment) -> tuple[Float, Float, Float]:
     """Pixels (M, 2), points (M, 3), mm, of the camera's frame, and sigma (M,), px, of the markers that were used."""
     used, positions = adjustment.used, adjustment.positions
     rotations, translations = adjustment.poses()
-    points = np.einsum("pij,nj->pni", rotations, adjustment.scene.points_mm) + translations[:, None]
+    points = seen_points(rotations, translations, adjustment.scene.points_mm)
     variance = np.trace(positions.covariance_px2[used], axis1=1, axis2=2) / 2 + adjustment.discrepancy_px**2
     return positions.centres_px[used], points[used], np.sqrt(variance)
 

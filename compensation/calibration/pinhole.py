@@ -28,6 +28,11 @@ def crosses(vectors: Float) -> Float:
     return matrices
 
 
+def seen_points(rotations: Float, translations_mm: Float, points_mm: Float) -> Float:
+    """(P, N, 3): points (N, 3) at poses (P, 3, 3) and (P, 3), in the camera's frame, mm."""
+    return np.einsum("pij,nj->pni", rotations, points_mm) + translations_mm[:, None]
+
+
 def across(axis: Float) -> Float:
     """(3, 2): unit vectors at right angles to a unit vector (3,) and each other, steady when it turns a little."""
     coordinate = np.eye(3)[np.argmin(np.abs(axis))]

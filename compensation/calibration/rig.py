@@ -19,8 +19,9 @@ from scipy.spatial.transform import Rotation
 from thermostand.compensation.calibration.adjustment import lens_sigma
 from thermostand.compensation.calibration.board import Board, shifts_by_camera
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise, next_discrepancy, whiteners
-from thermostand.compensation.calibration.pinhole import Pinhole, crosses
-from thermostand.compensation.calibration.views import LEAST_MARKERS, POSE, Views, calibrate_views, inliers
+from thermostand.compensation.calibration.pinhole import Pinhole, crosses, seen_points
+from thermostand.compensation.calibration.session_centres import Views
+from thermostand.compensation.calibration.views import LEAST_MARKERS, POSE, calibrate_views, inliers
 from thermostand.foundation.errors import CalibrationError
 
 LEAST_COMMON = 3
@@ -175,7 +176,7 @@ def _round(
     residuals: list[Float] = []
     for number, (views, shift) in enumerate(zip(cameras, shifts, strict=True)):
         turns, places = state.poses(number)
-        points = np.einsum("vij,nj->vni", turns, state.points_mm) + places[:, None]
+        points = seen_points(turns, places, state.points_mm)
         residuals.append(state.lenses[number].project(points) - (views.centres_px - shift))
     kept = tuple(np.where(mask[:, :, None], one, np.nan) for mask, one in zip(used, residuals, strict=True))
     return RigCalibration(state, solution.covariance, kept, discrepancies), residuals, chi2

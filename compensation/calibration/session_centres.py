@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,22 +115,12 @@ _LEAST_POSITIONS = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Positions:
-    """P table positions with the N markers of a target.
+class Views:
+    """P pictures with the N markers of a board. centres_px (P, N, 2): of the outlines, NaN where not seen.
+    covariance_px2 (P, N, 2, 2). image_size: (width, height), px."""
 
-    linear_mm, rotary_deg (P,). centres_px (P, N, 2): mean centres of the ellipses in the images, NaN where a marker was
-    missing or flagged in every frame. covariance_px2 (P, N, 2, 2): of the means. frames (P,): frames averaged.
-    flags (P, N) uint8: all flags of the frames. chi: scatter of the frames about their mean over the scatter the
-    detections' covariances predict, NaN with one frame each. image_size: (width, height), px.
-    """
-
-    linear_mm: Float
-    rotary_deg: Float
     centres_px: Float
     covariance_px2: Float
-    frames: NDArray[np.int64]
-    flags: NDArray[np.uint8]
-    chi: float
     image_size: tuple[int, int]
 
     @property
@@ -139,14 +129,35 @@ class Positions:
         return np.isfinite(self.centres_px[:, :, 0])
 
     @property
+    def variance_px2(self) -> float:
+        """Of a coordinate, mean over all markers."""
+        return float(np.nanmean(np.diagonal(self.covariance_px2, axis1=2, axis2=3)))
+
+    def part(self, chosen: NDArray[np.bool_]) -> Self:
+        """The pictures chosen (P,)."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: one[chosen] for name, one in values.items() if isinstance(one, np.ndarray)})
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Positions(Views):
+    """Views at P table positions, each the mean of some frames.
+
+    linear_mm, rotary_deg (P,). centres_px: NaN where a marker was missing or flagged in every frame. frames (P,):
+    frames averaged. flags (P, N) uint8: all flags of the frames. chi: scatter of the frames about their mean over the
+    scatter the detections' covariances predict, NaN with one frame each.
+    """
+
+    linear_mm: Float
+    rotary_deg: Float
+    frames: NDArray[np.int64]
+    flags: NDArray[np.uint8]
+    chi: float
+
+    @property
     def sigma_px(self) -> float:
         """Detection sigma per coordinate of the means: root mean square over all markers."""
-        return float(np.sqrt(np.nanmean(np.diagonal(self.covariance_px2, axis1=2, axis2=3))))
-
-    def part(self, chosen: NDArray[np.bool_]) -> Positions:
-        """The positions chosen (P,)."""
-        names = ("linear_mm", "rotary_deg", "centres_px", "covariance_px2", "frames", "flags")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        return float(np.sqrt(self.variance_px2))
 
 
 def observe_positions(session: Session, target: Target, report: Report | None = None) -> Positions:

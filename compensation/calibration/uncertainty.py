@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from thermostand.compensation.calibration.adjustment import Adjustment
 from thermostand.compensation.calibration.least_squares import Float
+from thermostand.compensation.calibration.pinhole import seen_points
 from thermostand.compensation.calibration.stage_geometry import ERRORS, PARAMETERS
 from thermostand.compensation.drift.hull import distances_px
 
@@ -120,7 +121,7 @@ def _between(first: Adjustment, second: Adjustment) -> tuple[Float, Float]:
     for adjustment in (first, second):
         rotations, translations = adjustment.scene.table.poses(linear, rotary, np.zeros((len(linear), ERRORS)))
         points = adjustment.board.points_mm
-        clouds.append((np.einsum("pij,nj->pni", rotations, points) + translations[:, None]).reshape(-1, 3))
+        clouds.append(seen_points(rotations, translations, points).reshape(-1, 3))
     return _rigid(*clouds)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thermostand.compensation.calibration.adjustment import Slopes, equations_of, lens_sigma
+from thermostand.compensation.calibration.adjustment import Problem, Slopes, whitened
 from thermostand.compensation.calibration.board import Board, shifts_by_camera, shifts_by_homography
 from thermostand.compensation.calibration.least_squares import (
     Float,
@@ -24,10 +24,10 @@ from thermostand.compensation.calibration.least_squares import (
     lengths_in_sigmas,
     minimise,
     next_discrepancy,
-    whiteners,
 )
-from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv, crosses
+from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv, crosses, seen_points
 from thermostand.compensation.calibration.pose import find_pose
+from thermostand.compensation.calibration.session_centres import Views
 from thermostand.compensation.calibration.uncertainty import NOT_SEEN, seen
 from thermostand.compensation.drift.hull import convex_hull
 from thermostand.foundation.errors import CalibrationError
@@ -111,30 +111,6 @@ _FOLDS = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Views:
-    """P pictures with the N markers of a board. centres_px (P, N, 2): of the outlines, NaN where not seen.
-    covariance_px2 (P, N, 2, 2). image_size: (width, height), px."""
-
-    centres_px: Float
-    covariance_px2: Float
-    image_size: tuple[int, int]
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(P, N): markers with a centre."""
-        return np.isfinite(self.centres_px[:, :, 0])
-
-    @property
-    def variance_px2(self) -> float:
-        """Of a coordinate, mean over all markers."""
-        return float(np.nanmean(np.diagonal(self.covariance_px2, axis1=2, axis2=3)))
-
-    def part(self, chosen: NDArray[np.bool_]) -> Views:
-        """The pictures chosen (P,)."""
-        return Views(self.centres_px[chosen], self.covariance_px2[chosen], self.image_size)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Posed:
     """Camera, rotations (P, 3, 3) and translations (P, 3), mm, of the views, and board points (N, 3), mm."""
 
@@ -142,6 +118,10 @@ class Posed:
     rotations: Float
     translations_mm: Float
     points_mm: Float
+
+    def seen_points(self) -> Float:
+        """(P, N, 3): the board's points in the camera's frame, mm."""
+        return seen_points(self.rotations, self.translations_mm, self.points_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,8 +139,7 @@ class ViewCalibration:
     def hull_px(self) -> Float:
         """(H, 2): of the markers that were used, where they are computed to be seen."""
         scene = self.scene
-        points_mm = np.einsum("pij,nj->pni", scene.rotations, scene.points_mm) + scene.translations_mm[:, None]
-        return convex_hull(scene.lens.project(points_mm[np.isfinite(self.residuals_px[:, :, 0])]))
+        return convex_hull(scene.lens.project(scene.seen_points()[np.isfinite(self.residuals_px[:, :, 0])]))
 
     @property
     def lens_sigma(self) -> Float:
@@ -223,10 +202,13 @@ def _round(
     shifts = shifts_by_camera(
         scene.lens.project, scene.rotations, scene.translations_mm, scene.points_mm, board.diameters_mm
     )
-    problem = _problem(views, shifts, used, board, discrepancy_px, scene.lens)
+    problem = _PosedProblem(
+        **whitened(views, board, lens=scene.lens, shifts_px=shifts, used=used, discrepancy_px=discrepancy_px)
+    )
     solution = minimise(scene, problem.residuals, problem.equations, problem.stepped)
-    chi2 = solution.cost / (problem.count - len(solution.covariance))
-    return solution, _residuals(solution.state, views.centres_px - shifts), chi2
+    state = solution.state
+    chi2 = solution.cost / (len(problem.residuals(state)) - len(solution.covariance))
+    return solution, state.lens.project(state.seen_points()) - (views.centres_px - shifts), chi2
 
 
 def cross_validated_px(views: Views, board: Board) -> float:
@@ -261,49 +243,27 @@ def _require_tilt(rotations: Float) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
-    """The whitened problem: M used markers, in view[m] of board point marker[m]."""
+class _PosedProblem(Problem[Posed]):
+    """Each view has a pose of its own, of which nothing is known beforehand."""
 
-    view: NDArray[np.int64]
-    marker: NDArray[np.int64]
-    centres_px: Float
-    whitener: Float
-    prior_mm: Float
-    sigma_mm: Float
-    lens_sigma: Float
+    def seen_points(self, scene: Posed) -> Float:
+        return self._turned(scene) + scene.translations_mm[self.picture]
 
-    @property
-    def count(self) -> int:
-        return 2 * len(self.view) + len(self.lens_sigma) + self.prior_mm.size
-
-    def residuals(self, scene: Posed) -> Float:
-        off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(self._points(scene)[1]) - self.centres_px)
-        board = (scene.points_mm - self.prior_mm) / self.sigma_mm
-        return np.concatenate([off.ravel(), scene.lens.distortion / self.lens_sigma, board.ravel()])
+    def _turned(self, scene: Posed) -> Float:
+        """(M, 3): the used markers turned as in their views."""
+        return np.einsum("mij,mj->mi", scene.rotations[self.picture], scene.points_mm[self.marker])
 
     def slopes(self, scene: Posed) -> Slopes:
         """Derivatives of the markers' residuals with respect to camera, pose and board point."""
-        turned, seen = self._points(scene)
+        turned, seen = self._turned(scene), self.seen_points(scene)
         by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
         return Slopes(
-            self.view,
+            self.picture,
             self.marker,
             self.whitener @ scene.lens.vector_jacobian(seen),
             np.concatenate([-by_point @ crosses(turned), by_point], axis=2),
-            by_point @ scene.rotations[self.view],
+            by_point @ scene.rotations[self.picture],
         )
-
-    def equations(self, scene: Posed, residuals: Float) -> tuple[Float, Float]:
-        """Normal matrix (n, n) and gradient (n,) of a step of camera, poses and board points."""
-        off = residuals[: 2 * len(self.view)].reshape(-1, 2)
-        normal, gradient = equations_of(self.slopes(scene), off, len(scene.rotations), len(self.prior_mm))
-        lens, count = len(scene.lens.vector), len(normal)
-        board = np.arange(count - self.prior_mm.size, count)
-        known = np.concatenate([np.arange(lens - len(self.lens_sigma), lens), board])
-        weights = np.concatenate([1 / self.lens_sigma, 1 / self.sigma_mm.ravel()])
-        normal[known, known] += weights**2
-        gradient[known] += weights * residuals[off.size :]
-        return normal, gradient
 
     def stepped(self, scene: Posed, change: Float) -> Posed:
         lens = len(scene.lens.vector)
@@ -314,33 +274,6 @@ class _Problem:
             scene.translations_mm + poses[:, 3:],
             scene.points_mm + change[-scene.points_mm.size :].reshape(-1, 3),
         )
-
-    def _points(self, scene: Posed) -> tuple[Float, Float]:
-        """(M, 3) each: the used markers turned as in their views, and in the camera's frame."""
-        turned = np.einsum("mij,mj->mi", scene.rotations[self.view], scene.points_mm[self.marker])
-        return turned, turned + scene.translations_mm[self.view]
-
-
-def _problem(
-    views: Views, shifts_px: Float, used: NDArray[np.bool_], board: Board, discrepancy_px: float, lens: Pinhole
-) -> _Problem:
-    view, marker = np.nonzero(used)
-    covariance = views.covariance_px2[used] + discrepancy_px**2 * np.eye(2)
-    centres = (views.centres_px - shifts_px)[used]
-    return _Problem(
-        view=view,
-        marker=marker,
-        centres_px=centres,
-        whitener=whiteners(covariance),
-        prior_mm=board.points_mm,
-        sigma_mm=board.sigma_mm,
-        lens_sigma=lens_sigma(lens),
-    )
-
-
-def _residuals(scene: Posed, discs_px: Float) -> Float:
-    seen = np.einsum("pij,nj->pni", scene.rotations, scene.points_mm) + scene.translations_mm[:, None]
-    return scene.lens.project(seen) - discs_px
 
 
 def inliers(residuals_px: Float, views: Views, discrepancy_px: float) -> NDArray[np.bool_]:

@@ -16,11 +16,11 @@ from thermostand.compensation.calibration.exports import EXPORTS, write_exports
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.pinhole import NAMES
 from thermostand.compensation.calibration.rig import RigCalibration, calibrate_rig
+from thermostand.compensation.calibration.session_centres import Views
 from thermostand.compensation.calibration.views import (
     LEAST_MARKERS,
     PointUncertainty,
     ViewCalibration,
-    Views,
     calibrate_views,
     cross_validated_px,
     known,

@@ -315,14 +315,14 @@ def test_the_recipes_positions_give_the_stands_camera_and_its_validation_positio
     centres = np.array([true_centres_px(optics(*place)) for place in places])
     covariance = np.tile(NOISE_px**2 * np.eye(2), (34, 54, 1, 1))
     seen = Positions(
-        places[:, 0],
-        places[:, 1],
-        centres + NOISE_px * random.standard_normal(centres.shape),
-        covariance,
-        np.full(34, 5),
-        np.zeros((34, 54), np.uint8),
-        1.0,
-        (2448, 2048),
+        linear_mm=places[:, 0],
+        rotary_deg=places[:, 1],
+        centres_px=centres + NOISE_px * random.standard_normal(centres.shape),
+        covariance_px2=covariance,
+        frames=np.full(34, 5),
+        flags=np.zeros((34, 54), np.uint8),
+        chi=1.0,
+        image_size=(2448, 2048),
     )
     found = adjust(seen, board_of(load_target(packaged("targets", "paper-9x6"))), TableSigma())
     true = optics(0.0, 0.0)

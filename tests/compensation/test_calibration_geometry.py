@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermostand.compensation.calibration.adjustment import Problem, TableScene, problem_of, table_from_poses
+from thermostand.compensation.calibration.adjustment import TableProblem, TableScene, table_from_poses, table_problem
 from thermostand.compensation.calibration.board import Board, shifts_by_camera, shifts_by_homography
 from thermostand.compensation.calibration.least_squares import Float, dense, minimise
 from thermostand.compensation.calibration.pinhole import Pinhole, across
@@ -89,21 +89,22 @@ def test_directions_across_an_axis_are_at_right_angles():
     assert np.abs(frame.T @ frame - np.eye(3)).max() < 1e-12
 
 
-def written_out(problem: Problem, scene: TableScene) -> Float:
+def written_out(problem: TableProblem, scene: TableScene) -> Float:
     """The derivatives of all residuals of the adjustment, nearly all of them zeros."""
-    slopes, count, free = problem.slopes(scene), len(problem.position), int(problem.freed.sum())
+    slopes, count, free = problem.slopes(scene), len(problem.picture), int(problem.freed.sum())
     lens, first_error = len(scene.lens.vector), slopes.common.shape[2]
     first_point = first_error + free * len(scene.errors)
-    matrix = np.zeros((problem.count, first_point + scene.points_mm.size))
-    for index, (position, marker) in enumerate(zip(problem.position, problem.marker, strict=True)):
+    rows = len(problem.residuals(scene))
+    matrix = np.zeros((rows, first_point + scene.points_mm.size))
+    for index, (position, marker) in enumerate(zip(problem.picture, problem.marker, strict=True)):
         own = slice(2 * index, 2 * index + 2)
         matrix[own, :first_error] = slopes.common[index]
         matrix[own, first_error + free * position : first_error + free * (position + 1)] = slopes.own[index]
         matrix[own, first_point + 3 * marker : first_point + 3 * marker + 3] = slopes.points[index]
     errors = np.tile(1 / problem.errors_sigma[problem.freed], len(scene.errors))
-    priors = np.concatenate([1 / problem.lens_sigma, errors, 1 / problem.sigma_mm.ravel()])
+    priors = np.concatenate([1 / problem.lens_sigma, errors, 1 / problem.board.sigma_mm.ravel()])
     columns = [*range(4, lens), *range(first_error, matrix.shape[1])]
-    matrix[np.arange(2 * count, problem.count), columns] = priors
+    matrix[np.arange(2 * count, rows), columns] = priors
     return matrix
 
 
@@ -121,11 +122,11 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
     known = board(laboratory)
     scene = TableScene(RATIONAL, table, errors, known.points_mm)
     sigma = TableSigma(0.0005, 0.1, 0.001, 0.2)
-    problem = problem_of(
+    problem = table_problem(
         seen, known, sigma, lens=RATIONAL, shifts_px=np.zeros_like(seen.centres_px), used=seen.seen, discrepancy_px=0.0
     )
     jacobian, residuals = written_out(problem, scene), problem.residuals(scene)
-    assert len(jacobian) == len(residuals) == problem.count
+    assert len(jacobian) == len(residuals)
     normal, gradient = problem.equations(scene, residuals)
     scale = np.sqrt(np.diag(normal))
     assert np.abs((normal - jacobian.T @ jacobian) / scale / scale[:, None]).max() < 1e-12

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.exports import EXPORTS
+from thermostand.compensation.calibration.session_centres import Views
 from thermostand.compensation.calibration.uncertainty import NOT_SEEN
 from thermostand.compensation.calibration.views import (
     ViewCalibration,
-    Views,
     calibrate_views,
     cross_validated_px,
     known,

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.rig import RigCalibration, calibrate_rig
-from thermostand.compensation.calibration.views import Views
+from thermostand.compensation.calibration.session_centres import Views
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import CalibrationError
 

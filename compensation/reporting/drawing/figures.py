@@ -136,6 +136,7 @@ def panels(
         for axes, panel in zip(places, shown, strict=True):
             for mark in panel.marks:
                 mark(axes)
+        for axes, panel in zip(places, shown, strict=True):  # once all is drawn: limits of one are those of its row
             axes.set(**panel.look)
             if panel.title:
                 axes.set_title(panel.title, fontsize=9, loc="left", pad=20 if panel.legend and not one_legend else None)

@@ -56,8 +56,7 @@ def residual_sizes(calibration: CameraCalibration) -> Figure:
         number = np.arange(1, len(rms_mpx) + 1)
         of_axes = zip(rms_mpx.T, _XY, strict=True)
         marks = [curve(number, values, colour, label, marker="o", **_JOINED) for values, (label, colour) in of_axes]
-        labels = {"xlabel": name, "ylabel": "RMS residual (mpx)"}
-        shown.append(Panel([*marks, sigma, lambda axes: axes.set_ylim(bottom=0)], look=labels))
+        shown.append(Panel([*marks, sigma], look={"xlabel": name, "ylabel": "RMS residual (mpx)", "ylim": (0, None)}))
     return panels(2, 2.9, shown)
 
 
@@ -128,10 +127,10 @@ def model_scores(calibration: CameraCalibration) -> Figure:
         lambda axes: axes.errorbar(rms_mpx, places, xerr=sigma_mpx, fmt="o", color=I_COLOUR, capsize=3),
         rule(1e3 * calibration.adjustment.positions.sigma_px, "detection sigma", upright=True),
         lambda axes: axes.set_yticks(places, [score.model for score in scores]),
-        lambda axes: axes.set_xlim(left=0),
     ]
-    labels = {"xlabel": "RMS at held-out positions, per coordinate (mpx)", "ylim": (len(scores) - 0.5, -0.5)}
-    return panels(1, 2.6, [Panel(marks, look=labels)])
+    labels = {"xlabel": "RMS at held-out positions, per coordinate (mpx)"}
+    limits = {"xlim": (0, None), "ylim": (len(scores) - 0.5, -0.5)}
+    return panels(1, 2.6, [Panel(marks, look={**labels, **limits})])
 
 
 _LABELS = ("shift I (px)", "shift J (px)", "change of scale (ppm)", "turn (µrad)")
@@ -188,7 +187,7 @@ def deviation_bars(validation: SpatialValidation) -> Figure:
     """The form of the paper's figure 15: mean absolute deviation at each temperature, before and after; dashed: the
     paper's means over its temperatures."""
     order = _by_temperature(validation)
-    place, labels = np.arange(len(order)), [f"{degC:z.1f}" for degC in validation.camera_degC[order]]
+    place, ticks = np.arange(len(order)), [f"{degC:z.1f}" for degC in validation.camera_degC[order]]
     sides = (
         (validation.before, I_COLOUR, -0.2, BEFORE_mm, "before"),
         (validation.after, J_COLOUR, 0.2, AFTER_mm, "after"),
@@ -200,9 +199,10 @@ def deviation_bars(validation: SpatialValidation) -> Figure:
             height, u = one.per_temperature_um[order, axis], one.u_per_temperature_um[order, axis]
             marks.append(bars(place + side, height, u, colour, name))
             marks.append(rule(1e3 * paper_mm[axis], f"mean of the paper's, {name}", colour=colour))
-        marks.append(lambda axes: axes.set_xticks(place, labels, rotation=90, fontsize=7))
-        marks.append(lambda axes: (axes.grid(visible=False, axis="x"), axes.set_ylim(bottom=0)))
-        shown.append(Panel(marks, title, look={"xlabel": "camera (°C)", "ylabel": "mean |deviation| (µm)"}))
+        marks.append(lambda axes: axes.set_xticks(place, ticks, rotation=90, fontsize=7))
+        marks.append(lambda axes: axes.grid(visible=False, axis="x"))
+        labels = {"xlabel": "camera (°C)", "ylabel": "mean |deviation| (µm)"}
+        shown.append(Panel(marks, title, look={**labels, "ylim": (0, None)}))
     return panels(3, 3.3, shown, one_legend=True)
 
 
