@@ -116,7 +116,7 @@ class _Cells(NamedTuple):
     """Cells of BLOCK_px columns that follow each other; a strip is so many, whose offsets begin at that of `first`."""
 
     first: int
-    count: int
+    cells: int
 
 
 class _Room(NamedTuple):
@@ -166,7 +166,7 @@ def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, ou
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _read_band(image: Image, band: int, from_x: Float32, strip: _Cells, table: Float32, room: _Room) -> None:
     """BLOCK_px rows of the source, in a strip, at the places that the result asks for."""
-    whole, weights, row, cells = room.whole, room.weights, room.row, strip.count
+    whole, weights, row, cells = room.whole, room.weights, room.row, strip.cells
     height, last = image.shape[0], from_x.shape[0] - 1
     upper, lower = from_x[min(max(band, 0), last)], from_x[min(max(band + 1, 0), last)]
     _weigh(upper, lower, strip, table, whole, weights)
@@ -206,7 +206,7 @@ def _weigh(upper: Float32, lower: Float32, strip: _Cells, table: Float32, whole:
     (TAPS, pixels)."""
     corners = np.empty((4, TAPS), np.float32)
     before, here, there = _NOWHERE, _AT(0), _AT(2)
-    for cell in range(strip.count):
+    for cell in range(strip.cells):
         at, behind = _AT(strip.first + cell), _AT(strip.first + cell + 1)
         own = math.floor(np.float32(0.25) * (upper[at] + upper[behind] + lower[at] + lower[behind]))
         whole[cell] = own
@@ -266,7 +266,7 @@ def _mean_along(row: Float32, shift: int, weights: Float32, down: np.float32, ru
     named one by one: the processor then takes many pixels at once."""
     w, d = weights[:TAPS], weights[TAPS:]
     k0, k1, k2, k3, k4, k5, k6, k7 = _AT(0), _AT(1), _AT(2), _AT(3), _AT(4), _AT(5), _AT(6), _AT(7)
-    for n in range(_AT(run.first * BLOCK_px), _AT((run.first + run.count) * BLOCK_px)):
+    for n in range(_AT(run.first * BLOCK_px), _AT((run.first + run.cells) * BLOCK_px)):
         x = n + _AT(shift)
         line[n] = (
             (w[k0, n] + down * d[k0, n]) * row[x]
@@ -288,7 +288,7 @@ def _mean_of_rows(held: Float32, top: int, weights: Float32, down: np.float32, r
     r0, r1, r2, r3 = (top % _HELD_ROWS, (top + 1) % _HELD_ROWS, (top + 2) % _HELD_ROWS, (top + 3) % _HELD_ROWS)
     r4, r5, r6, r7 = ((top + 4) % _HELD_ROWS, (top + 5) % _HELD_ROWS, (top + 6) % _HELD_ROWS, (top + 7) % _HELD_ROWS)
     h0, h1, h2, h3, h4, h5, h6, h7 = held[r0], held[r1], held[r2], held[r3], held[r4], held[r5], held[r6], held[r7]
-    for n in range(_AT(run.first * BLOCK_px), _AT((run.first + run.count) * BLOCK_px)):
+    for n in range(_AT(run.first * BLOCK_px), _AT((run.first + run.cells) * BLOCK_px)):
         line[n] = (
             (w[k0, n] + down * d[k0, n]) * h0[n]
             + (w[k1, n] + down * d[k1, n]) * h1[n]

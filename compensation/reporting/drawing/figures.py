@@ -155,7 +155,7 @@ def curve(
 ) -> Mark:
     """Points (M,) and what joins them; error (M,): half of each one's bar along y. look: as matplotlib's lines have
     it."""
-    usual = {"linewidth": 1.0, "markersize": 4, "color": colour, "label": label}
+    usual: dict[str, Any] = {"linewidth": 1.0, "markersize": 4, "color": colour, "label": label}
     if error is None:
         return lambda axes: axes.plot(x, y, **usual | look)
     return lambda axes: axes.errorbar(x, y, error, **usual | look)
@@ -169,7 +169,7 @@ def dots(x: ArrayLike, y: ArrayLike, colour: str, label: str) -> Mark:
 
 def rule(at: float, label: str | None = None, *, upright: bool = False, colour: str = GREY, style: str = "--") -> Mark:
     """A line through the whole panel."""
-    look = {"color": colour, "linewidth": 0.8, "linestyle": style, "label": label}
+    look: dict[str, Any] = {"color": colour, "linewidth": 0.8, "linestyle": style, "label": label}
     return lambda axes: axes.axvline(at, **look) if upright else axes.axhline(at, **look)
 
 
@@ -188,7 +188,7 @@ def histogram(values: Float, bins: Any, colour: str, label: str, **look: Any) ->
     return lambda axes: axes.hist(values, bins, color=colour, label=label, **look)
 
 
-def bars(places: Float, height: Float, error: Float, colour: str, label: str) -> Mark:
+def bars(places: ArrayLike, height: Float, error: Float, colour: str, label: str) -> Mark:
     """Upright bars (M,) with their uncertainties."""
     return lambda axes: axes.bar(places, height, 0.4, yerr=error, color=colour, error_kw={"lw": 0.8}, label=label)
 

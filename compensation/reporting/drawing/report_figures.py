@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -60,7 +61,7 @@ def warm_up_curves(observations: Observations, curves: Sequence[WarmUpTrack], ti
     for one, title in zip(curves, titles, strict=True):
         drawn = thinned(len(one.since_on_s), CURVE_POINTS)
         minutes = one.since_on_s[drawn] / _S_PER_MIN
-        look = {"linewidth": 0.9, "marker": "o" if len(drawn) <= 100 else None, "markersize": 2.4}
+        look: dict[str, Any] = {"linewidth": 0.9, "marker": "o" if len(drawn) <= 100 else None, "markersize": 2.4}
         drift = zip(COORDINATES, one.track.mean_px[drawn].T, strict=True)
         marks = [curve(minutes, values, colour, f"{mean}{name}", **look) for (name, colour), values in drift]
         above.append(Panel(marks, title, look={"ylabel": "drift (px)"}))
@@ -323,7 +324,7 @@ def _targets(
     for number, place in enumerate(places):
         ends = np.array([_end(*place, side * half_mm) for side in (-1, 1)])
         label = None if number else f"{name}, {len(places)} positions"
-        yield curve(*ends.T, colour, label, linewidth=width, solid_capstyle="round")
+        yield curve(ends[:, 0], ends[:, 1], colour, label, linewidth=width, solid_capstyle="round")
 
 
 def _end(linear_mm: float, rotary_deg: float, away_mm: float) -> tuple[float, float]:
