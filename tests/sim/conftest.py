@@ -1,10 +1,11 @@
-"""A fake camera that answers at an address of its own, and its client."""
+"""A fake camera that answers at an address of its own, and its client; simulated stages on the bench."""
 
 from collections.abc import Iterator
 
 import pytest
 
 from tests.sim.camera_client import HEIGHT, START_NS, WIDTH, Client, address, render, still_plant
+from tests.sim.ximc_bench import Bench as StageBench
 from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults
@@ -39,3 +40,13 @@ def client(camera: FakeCamera) -> Iterator[Client]:
     client = Client()
     yield client
     client.close()
+
+
+@pytest.fixture
+def linear() -> StageBench:
+    return StageBench("linear")
+
+
+@pytest.fixture
+def rotary() -> StageBench:
+    return StageBench("rotary")

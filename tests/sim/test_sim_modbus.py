@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pymodbus import FramerType
-from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from pymodbus.client import ModbusSerialClient
 from pymodbus.exceptions import ModbusIOException
 
+from tests.sim.unit_bench import gateway_master, serial_master
 from thermostand.drivers.sim.units.modbus import (
     ILLEGAL_ADDRESS,
     ModbusRefusal,
@@ -27,7 +27,7 @@ from thermostand.drivers.sim.units.modbus import (
     writes_one,
     writes_words,
 )
-from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
+from thermostand.drivers.sim.wire import LinkFaults
 
 
 class Store:
@@ -165,12 +165,8 @@ def test_a_header_of_another_protocol_is_skipped_behind_the_gateway() -> None:
 @pytest.fixture
 def bus(tmp_path: Path) -> Iterator[tuple[LinkFaults, ModbusSerialClient]]:
     faults = LinkFaults()
-    wire = PtyWire(tmp_path / "bus", RtuEngine([Store(1), Store(7)]), faults)
-    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=115200, timeout=3.0, retries=0)
-    assert client.connect()
-    yield faults, client
-    client.close()
-    wire.close()
+    with serial_master(tmp_path / "bus", [Store(1), Store(7)], faults) as client:
+        yield faults, client
 
 
 def test_pymodbus_reads_and_writes_over_a_pseudo_terminal(bus: tuple[LinkFaults, ModbusSerialClient]) -> None:
@@ -195,11 +191,7 @@ def test_pymodbus_gets_no_answer_from_a_unit_that_is_not_there(bus: tuple[LinkFa
 
 def test_pymodbus_reads_through_the_gateway() -> None:
     units = [Store(1), Store(2)]
-    wire = TcpWire("127.0.0.1", 0, lambda: TcpEngine(units), LinkFaults())
-    client = ModbusTcpClient("127.0.0.1", port=wire.port, timeout=5, retries=0)
-    assert client.connect()
-    assert client.read_input_registers(0x20, count=3, device_id=2).registers == [0x20, 0x21, 0x22]
-    assert not client.write_register(9, 99, device_id=1).isError()
-    assert units[0].written == [(9, (99,))]
-    client.close()
-    wire.close()
+    with gateway_master(units) as client:
+        assert client.read_input_registers(0x20, count=3, device_id=2).registers == [0x20, 0x21, 0x22]
+        assert not client.write_register(9, 99, device_id=1).isError()
+        assert units[0].written == [(9, (99,))]

@@ -6,38 +6,33 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
-from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
+from tests.sim.unit_bench import START_NS, UnitBench, serial_master
+from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import RtuEngine
 from thermostand.drivers.sim.units.regulator import FakeRegulator
-from thermostand.drivers.sim.wire import LinkFaults, PtyWire
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
-START_NS = 1_700_000_000_000_000_000
 RUN, STOP, WRITING_ON, RAM_MODE, BACKUP_MODE = 0x0100, 0x0101, 0x0001, 0x0401, 0x0400
 
 
-class Bench:
-    """A regulator in the chamber, its heater enabled, with a clock the test moves."""
+class Bench(UnitBench):
+    """A regulator in the chamber, its heater enabled."""
 
     def __init__(self, initial_degC: float = 24.0) -> None:
-        self.plant = Plant(PlantSpec(laboratory_swing_K=0.0, initial_degC=initial_degC), START_NS)
+        super().__init__(self._made, initial_degC)
         self.plant.heater_enabled = True
-        self.clock = FollowedClock(START_NS)
-        self.regulator = FakeRegulator(self.plant, self.clock, 1)
 
-    def ask(self, request: str) -> str | None:
-        reply = self.regulator.handle(bytes.fromhex(request))
-        return None if reply is None else reply.hex(" ").upper()
+    def _made(self, plant: Plant, clock: FollowedClock) -> FakeRegulator:
+        self.regulator = FakeRegulator(plant, clock, 1)
+        return self.regulator
 
     def command(self, value: int) -> None:
-        assert self.ask(f"06 0000 {value:04X}") == f"06 00 00 {value >> 8:02X} {value & 0xFF:02X}"
+        self.done(f"06 0000 {value:04X}")
 
     def read(self, address: int) -> int:
-        reply = self.regulator.handle(bytes.fromhex(f"03 {address:04X} 0001"))
-        assert reply is not None
+        reply = self.reply(f"03 {address:04X} 0001")
         assert reply[:2] == b"\x03\x02"
         return int.from_bytes(reply[2:], "big", signed=True)
 
@@ -45,7 +40,7 @@ class Bench:
         return self.ask(f"06 {address:04X} {value & 0xFFFF:04X}")
 
     def wait(self, duration_s: float) -> None:
-        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        super().wait(duration_s)
         self.read(0x2000)
 
     def run_at(self, setpoint_degC: float) -> None:
@@ -115,8 +110,7 @@ def test_refusals_and_echoes_follow_the_manual(bench: Bench, request_hex: str, r
 
 
 def test_104_words_are_read_at_once_and_holes_read_as_zero(bench: Bench) -> None:
-    reply = bench.regulator.handle(bytes.fromhex("03 2000 0068"))
-    assert reply is not None
+    reply = bench.reply("03 2000 0068")
     assert len(reply) == 2 + 2 * 104
     assert reply[2:4] == (240).to_bytes(2, "big")
     assert not any(reply[2 + 2 * 6 :])
@@ -352,13 +346,8 @@ def test_faults_of_the_probe_and_of_the_set_point_show_on_the_wire(bench: Bench)
 
 @pytest.fixture
 def client(bench: Bench, tmp_path: Path) -> Iterator[ModbusSerialClient]:
-    wire = PtyWire(tmp_path / "bus", RtuEngine([bench.regulator]), LinkFaults())
-    # No parity here: a pseudo-terminal carries none, and some kernels refuse to be asked for it.
-    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=9600, timeout=3, retries=0)
-    assert client.connect()
-    yield client
-    client.close()
-    wire.close()
+    with serial_master(tmp_path / "bus", [bench.regulator]) as client:
+        yield client
 
 
 def test_pymodbus_starts_it_up_and_heats_the_chamber(bench: Bench, client: ModbusSerialClient) -> None:

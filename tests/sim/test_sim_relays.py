@@ -5,43 +5,30 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from pymodbus import FramerType
-from pymodbus.client import ModbusSerialClient
 
+from tests.sim.unit_bench import START_NS, UnitBench, serial_master
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import RtuEngine
 from thermostand.drivers.sim.units.relays import FakeRelays
-from thermostand.drivers.sim.wire import LinkFaults, PtyWire
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
-START_NS = 1_700_000_000_000_000_000
 HEATER, COMPRESSOR, CAMERA = 0, 2, 5
 CHANNELS = {"heater_enable": HEATER, "compressor": COMPRESSOR, "camera_power": CAMERA}
 ARM_15_S = f"05 02{HEATER:02X} 0096"
 
 
-class Bench:
-    """A board in the plant, with a clock the test moves."""
+class Bench(UnitBench):
+    """A board in the plant."""
 
     def __init__(self) -> None:
-        self.plant = Plant(PlantSpec(), START_NS)
-        self.clock = FollowedClock(START_NS)
-        self.board = FakeRelays(self.plant, self.clock, 1, CHANNELS)
+        super().__init__(self._made)
 
-    def ask(self, request: str) -> str | None:
-        reply = self.board.handle(bytes.fromhex(request))
-        return None if reply is None else reply.hex(" ").upper()
-
-    def done(self, request: str) -> None:
-        assert self.ask(request) == bytes.fromhex(request).hex(" ").upper()
+    def _made(self, plant: Plant, clock: FollowedClock) -> FakeRelays:
+        self.board = FakeRelays(plant, clock, 1, CHANNELS)
+        return self.board
 
     def coils(self) -> int:
-        reply = self.board.handle(bytes.fromhex("01 0000 0008"))
-        assert reply is not None
-        return reply[2]
-
-    def wait(self, duration_s: float) -> None:
-        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        return self.reply("01 0000 0008")[2]
 
 
 @pytest.fixture
@@ -214,13 +201,9 @@ def test_an_unknown_contact_or_relay_number_is_a_mistake_of_the_caller() -> None
 
 
 def test_pymodbus_switches_and_reads_back_over_a_pseudo_terminal(bench: Bench, tmp_path: Path) -> None:
-    wire = PtyWire(tmp_path / "bus", RtuEngine([bench.board]), LinkFaults())
-    client = ModbusSerialClient(str(tmp_path / "bus"), framer=FramerType.RTU, baudrate=9600, timeout=3, retries=0)
-    assert client.connect()
-    assert not client.write_coil(CAMERA, True, device_id=1).isError()
-    assert not client.write_coils(0, [True, False, True], device_id=1).isError()
-    expected = [True, False, True, False, False, True, False, False]
-    assert client.read_coils(0, count=8, device_id=1).bits == expected
-    assert client.read_holding_registers(0x8000, count=1, device_id=1).registers == [200]
-    client.close()
-    wire.close()
+    with serial_master(tmp_path / "bus", [bench.board]) as client:
+        assert not client.write_coil(CAMERA, True, device_id=1).isError()
+        assert not client.write_coils(0, [True, False, True], device_id=1).isError()
+        expected = [True, False, True, False, False, True, False, False]
+        assert client.read_coils(0, count=8, device_id=1).bits == expected
+        assert client.read_holding_registers(0x8000, count=1, device_id=1).registers == [200]

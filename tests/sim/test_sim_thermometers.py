@@ -6,49 +6,42 @@ import math
 import struct
 
 import pytest
-from pymodbus.client import ModbusTcpClient
 
-from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
-from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, crc16
+from tests.sim.unit_bench import START_NS, UnitBench, gateway_master
+from thermostand.drivers.sim.physics.plant import Plant
+from thermostand.drivers.sim.units.modbus import RtuEngine, crc16
 from thermostand.drivers.sim.units.thermometers import FakeThermometers
-from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
-START_NS = 1_700_000_000_000_000_000
 CHANNELS = {"granite_inside": 0, "granite_outside": 1, "artifact": 2, "air": 3, "laboratory": 5}
 UNCONNECTED = 4
 LSB_K = 100 / 32767
 
 
-class Bench:
-    """A module in the plant, with a clock the test moves."""
+class Bench(UnitBench):
+    """A module in the plant."""
 
     def __init__(self, initial_degC: float = 30.0, seed: int = 7) -> None:
-        self.plant = Plant(PlantSpec(laboratory_swing_K=0.0, initial_degC=initial_degC), START_NS)
-        self.clock = FollowedClock(START_NS)
-        self.module = FakeThermometers(self.plant, self.clock, 3, CHANNELS, seed)
+        self._seed = seed
+        super().__init__(self._made, initial_degC)
 
-    def ask(self, request: str) -> str | None:
-        reply = self.module.handle(bytes.fromhex(request))
-        return None if reply is None else reply.hex(" ").upper()
+    def _made(self, plant: Plant, clock: FollowedClock) -> FakeThermometers:
+        self.module = FakeThermometers(plant, clock, 3, CHANNELS, self._seed)
+        return self.module
 
     def words(self) -> tuple[int, ...]:
-        reply = self.module.handle(bytes.fromhex("04 0000 0006"))
-        assert reply is not None
-        return struct.unpack(">BB6h", reply)[2:]
+        return struct.unpack(">BB6h", self.reply("04 0000 0006"))[2:]
 
     def air_K(self, duration_s: float, count: int) -> list[float]:
         """What the air sensor reads wrong, `count` times, duration_s apart."""
         errors: list[float] = []
         for _ in range(count):
-            self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+            self.wait(duration_s)
             errors.append(self.words()[CHANNELS["air"]] * LSB_K - self.plant.air_degC)
         return errors
 
     def faults(self) -> int:
-        reply = self.module.handle(bytes.fromhex("02 0080 0006"))
-        assert reply is not None
-        return reply[2]
+        return self.reply("02 0080 0006")[2]
 
 
 @pytest.fixture
@@ -79,7 +72,7 @@ def test_below_zero_the_words_are_negative() -> None:
 )
 def test_the_type_code_sets_the_scale_of_its_channel(bench: Bench, code: int, full_scale_degC: float) -> None:
     request = f"06 0103 {code:04X}"
-    assert bench.ask(request) == bytes.fromhex(request).hex(" ").upper()
+    bench.done(request)
     assert bench.ask("03 0103 0001") == f"03 02 00 {code:02X}"
     words = bench.words()
     assert words[3] * full_scale_degC / 32767 == pytest.approx(30.0, abs=0.03)
@@ -202,13 +195,10 @@ def test_an_unknown_sensor_or_channel_number_is_a_mistake_of_the_caller(bench: B
 
 
 def test_pymodbus_reads_values_bits_and_type_codes_through_a_gateway(bench: Bench) -> None:
-    wire = TcpWire("127.0.0.1", 0, lambda: TcpEngine([bench.module]), LinkFaults())
-    client = ModbusTcpClient("127.0.0.1", port=wire.port, timeout=5, retries=0)
-    assert client.connect()
-    registers = client.read_input_registers(0, count=6, device_id=3).registers
-    assert registers[3] * LSB_K == pytest.approx(30.0, abs=0.02)
-    assert client.read_discrete_inputs(0x80, count=6, device_id=3).bits[:6] == [False] * 4 + [True, False]
-    assert not client.write_register(0x103, 0x2E, device_id=3).isError()
-    assert client.read_holding_registers(0x100, count=6, device_id=3).registers == [0x20] * 3 + [0x2E] + [0x20] * 2
-    client.close()
-    wire.close()
+    with gateway_master([bench.module]) as client:
+        registers = client.read_input_registers(0, count=6, device_id=3).registers
+        assert registers[3] * LSB_K == pytest.approx(30.0, abs=0.02)
+        assert client.read_discrete_inputs(0x80, count=6, device_id=3).bits[:6] == [False] * 4 + [True, False]
+        assert not client.write_register(0x103, 0x2E, device_id=3).isError()
+        types = client.read_holding_registers(0x100, count=6, device_id=3).registers
+        assert types == [0x20] * 3 + [0x2E] + [0x20] * 2

@@ -35,11 +35,6 @@ LIBXIMC_REQUESTS = [
 ]  # fmt: skip
 
 
-@pytest.fixture
-def linear() -> Bench:
-    return Bench("linear")
-
-
 def test_the_controller_says_who_it_is(linear: Bench) -> None:
     assert linear.ask("gser", size=10) == struct.pack("<I", 0x1234)
     assert linear.ask("geti", size=36) == struct.pack("<4s2s8sBBH12x", b"XIMC", b"SM", b"XISM-USB", 2, 3, 8)

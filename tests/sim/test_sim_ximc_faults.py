@@ -21,16 +21,6 @@ from tests.sim.ximc_bench import (
 from thermostand.foundation.clock import seconds_ns
 
 
-@pytest.fixture
-def linear() -> Bench:
-    return Bench("linear")
-
-
-@pytest.fixture
-def rotary() -> Bench:
-    return Bench("rotary")
-
-
 def test_an_alarm_stops_the_motor_until_stop_clears_it(linear: Bench) -> None:
     linear.move(1_000)
     linear.wait(0.75)

@@ -27,16 +27,6 @@ from thermostand.drivers.framing.ximc import encode
 RIGHT_EDGE, LEFT_EDGE = 1, 2
 
 
-@pytest.fixture
-def linear() -> Bench:
-    return Bench("linear")
-
-
-@pytest.fixture
-def rotary() -> Bench:
-    return Bench("rotary")
-
-
 # Motion
 
 
