@@ -1,4 +1,4 @@
-"""`make bench`: every benchmark, one table. `python -m tests.bench modbus camera` runs the named ones only."""
+"""`make bench`: every benchmark, one table. `python -m tests.bench abort camera` runs the named ones only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import cv2
 from tests.bench.figures import Figure, Missing, progress, skipped, table
 
 BENCHMARKS = (
-    *("virtual_time", "night", "abort", "jitter", "viewers", "regulators", "modbus", "camera", "calibration", "codec"),
+    *("virtual_time", "night", "abort", "jitter", "viewers", "regulators", "camera", "calibration", "codec"),
     *("line_rate", "reading", "listing", "markers", "photographs", "claimed_variances", "drift", "datasheet", "dwells"),
     *("known", "warp", "c_header", "pipeline", "cluster", "identification", "start", "stop", "page"),
 )

@@ -9,12 +9,20 @@ from __future__ import annotations
 
 import asyncio
 import math
+import subprocess
+import sys
 import time
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
-from tests.bench.fakes import fakes
+import numpy as np
+from numpy.typing import NDArray
+
 from tests.bench.figures import Figure, progress, require_aravis, side_by_side
 from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.sim.gige.camera import FakeCamera, HEIGHT_px, WIDTH_px
+from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
 from thermostand.foundation.clock import WallClock
 
@@ -40,7 +48,7 @@ def _at_pace(what: str, pace_MBps: int) -> Figure:
     settings = GigeCameraSettings(
         address=ADDRESS, serial_number=SERIAL_NUMBER, exposure_s=0.001, packet_size=PACKET_SIZE
     )
-    with fakes("camera", ADDRESS, SERIAL_NUMBER, pace_MBps):
+    with _fake(pace_MBps):
         own, limit = asyncio.run(_measure(Camera("camera", settings, WallClock()), pace_MBps))
     return side_by_side(what, "frames/s", f"wire paced at {pace_MBps} MB/s", own, limit)
 
@@ -61,3 +69,39 @@ async def _frames_per_second(camera: Camera) -> float:
     for _ in range(FRAMES):
         await camera.grab()
     return FRAMES / (time.perf_counter() - begin_s)
+
+
+@contextmanager
+def _fake(pace_MBps: int) -> Generator[None]:
+    """The camera, in a process of its own, until the block ends."""
+    command = [sys.executable, "-m", "tests.bench.camera", str(pace_MBps)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            if process.stdout.readline() != "ready\n":
+                raise ValueError("the camera did not start")
+            yield
+        finally:
+            process.stdin.close()
+
+
+def main() -> None:
+    """The fake: its image costs nothing and leaves at once when it is triggered, as in virtual time."""
+    clock = WallClock()
+    image = np.random.default_rng(1).integers(0, 256, (HEIGHT_px, WIDTH_px), dtype=np.uint8)
+
+    def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
+        return image[:rows]
+
+    plant = Plant(PlantSpec(camera_powered=True), clock.now_ns())
+    fake = FakeCamera(plant, clock, render, ADDRESS, SERIAL_NUMBER, pace_MBps=float(sys.argv[1]))
+    fake.start()
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    sys.stdin.read()
+    fake.close()
+
+
+if __name__ == "__main__":
+    main()

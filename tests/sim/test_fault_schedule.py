@@ -12,7 +12,7 @@ import pytest
 from tests.addresses import camera_address
 from thermostand.drivers.sim.control import Control
 from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
-from thermostand.drivers.sim.laboratory_faults import FAULTS, FaultSchedule, PlannedFault, inject, parse_fault
+from thermostand.drivers.sim.laboratory_faults import FAULTS, FaultSchedule, PlannedFault, inject, known_to, parse_fault
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.stand_config import load_config, packaged
@@ -34,6 +34,10 @@ def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Labor
         devices["chamber"] = {"fake": "climate_chamber.espec", "settings": request.param}
     devices["heat_module"] = {"fake": "heat_module", "settings": {"unit": 9, "channel": 0}}
     devices["imager"] = {"fake": "imager", "settings": {"folder": None, "spots": {"lens": {"x_px": 80, "y_px": 60}}}}
+    devices["reference"] = {
+        "fake": "probes.hart",
+        "settings": {"protocol": "hart", "serial_number": None, "address": "tcp:127.0.0.1:0"},
+    }
     devices["linear"]["settings"]["address"] = f"serial:{tmp_path / 'linear'}"
     devices["camera"]["settings"]["address"] = camera_address()
     built = Laboratory(parse_document(json.dumps(described), LaboratorySpec, "laboratory"))
@@ -80,6 +84,16 @@ def test_each_fault_of_the_table_is_set_and_mended(laboratory: Laboratory):
         inject(laboratory, name, fault.worst)
         inject(laboratory, name, fault.mended)
         assert fault.text, name
+
+
+def test_every_line_of_the_stand_has_the_faults_of_a_link(laboratory: Laboratory):
+    with pytest.raises(ConfigError, match=r"no reference\.drop"):
+        parse_fault("reference.drop=0.5")
+    schedule = FaultSchedule(laboratory, [parse_fault("reference.drop=0.5", known_to(laboratory))])
+    assert schedule.standing() == {"reference.drop": 0.5}
+    assert laboratory.link("reference").faults.drop == 0.5
+    schedule.mend("reference.drop")
+    assert laboratory.link("reference").faults.drop == 0.0
 
 
 def test_planned_faults_come_and_go_at_their_instants(laboratory: Laboratory):

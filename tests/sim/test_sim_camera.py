@@ -131,14 +131,6 @@ def test_silence_can_be_had_on_either_channel_alone(client: Client, faults: Came
     assert client.stream_is_silent()
 
 
-def test_a_trigger_executed_twice_gives_two_frames(client: Client, faults: CameraFaults) -> None:
-    faults.trigger_twice = True
-    client.connect(8000)
-    client.arm()
-    client.set("TriggerSoftware", 1)
-    assert [client.packets()[0].block_id for _ in range(2)] == [1, 2]
-
-
 # ----------------------------------------------------------------------------------------------------- Aravis' arv-tool
 
 

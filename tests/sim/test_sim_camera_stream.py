@@ -12,18 +12,17 @@ from tests.sim.camera_client import (
     START_NS,
     WIDTH,
     Client,
-    SILENCE_s,
     WAIT_s,
     address,
     expected,
     image_of,
     render,
 )
-from tests.sim.gvcp_client import Packet, decode_leader, pack_words
+from tests.sim.gvcp_client import decode_leader, pack_words
 from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige import gvsp
 from thermostand.drivers.sim.gige.camera import FakeCamera
-from thermostand.drivers.sim.gige.gvcp import GvcpCommand, GvcpStatus, Resend
+from thermostand.drivers.sim.gige.gvcp import GvcpCommand, Resend
 from thermostand.drivers.sim.gige.gvsp import PacketKind
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamSender
 from thermostand.foundation.clock import FollowedClock, seconds_ns
@@ -58,47 +57,6 @@ def test_every_trigger_gives_one_frame_with_the_next_id(client: Client, clock: F
     assert client.stream_is_silent()
 
 
-def test_a_free_run_in_virtual_time_sends_only_the_latest_frame(
-    client: Client, camera: FakeCamera, clock: FollowedClock
-) -> None:
-    client.connect()
-    client.set("ExposureTime", 100_000.0)
-    client.set("AcquisitionFrameRate", 2.0)
-    client.set("AcquisitionFrameRateEnable", 1)
-    client.set("AcquisitionStart", 1)
-    clock.follow(START_NS + seconds_ns(1.3))
-    camera.advance(clock.now_ns())
-    packets = client.packets()
-    assert packets[0].block_id == 3
-    assert decode_leader(packets[0].data).timestamp == seconds_ns(1.0)
-    np.testing.assert_array_equal(image_of(packets), expected(1.0))
-    camera.advance(clock.now_ns())
-    assert client.stream_is_silent()
-
-
-def test_a_region_is_cut_from_the_sensor(client: Client) -> None:
-    client.connect()
-    for name, value in (("Width", 64), ("Height", 32), ("OffsetX", 8), ("OffsetY", 4)):
-        assert client.set(name, value) == GvcpStatus.OK
-    assert client.get("PayloadSize") == 64 * 32
-    client.arm()
-    client.set("TriggerSoftware", 1)
-    packets = client.packets()
-    leader = decode_leader(packets[0].data)
-    assert (leader.width, leader.height, leader.offset_x, leader.offset_y) == (64, 32, 8, 4)
-    np.testing.assert_array_equal(image_of(packets), expected(0.0)[4:36, 8:72])
-
-
-def test_mono12_carries_the_grey_value_in_the_upper_8_of_12_bits(client: Client) -> None:
-    client.connect()
-    client.set("PixelFormat", gvsp.PixelFormat.MONO12)
-    assert client.get("PayloadSize") == 2 * WIDTH * HEIGHT
-    client.arm()
-    client.set("TriggerSoftware", 1)
-    pixels = b"".join(packet.data for packet in client.packets() if packet.kind == PacketKind.PAYLOAD)
-    np.testing.assert_array_equal(np.frombuffer(pixels, "<u2"), expected(0.0).ravel().astype("<u2") * 16)
-
-
 def test_extended_ids_carry_the_same_image(plant: StillPlant, clock: FollowedClock) -> None:
     camera = FakeCamera(plant, clock, render, address(), "SN1", size_px=(WIDTH, HEIGHT), extended_ids=True)
     camera.start()
@@ -115,28 +73,6 @@ def test_extended_ids_carry_the_same_image(plant: StillPlant, clock: FollowedClo
     finally:
         client.close()
         camera.close()
-
-
-def test_a_frame_with_a_third_of_its_packets_lost_is_completed_by_resends(
-    client: Client, camera: FakeCamera, faults: CameraFaults
-) -> None:
-    faults.loss = 0.3
-    client.connect(576)
-    client.arm()
-    client.set("TriggerSoftware", 1)
-    whole = gvsp.ImageBlock(1, gvsp.Leader(0, 0, WIDTH, HEIGHT), memoryview(bytes(WIDTH * HEIGHT)), 576)
-    got: dict[int, Packet] = {}
-    while len(got) <= whole.trailer_id:
-        try:
-            packet = client.packet(SILENCE_s)
-            got.setdefault(packet.packet_id, packet)
-        except TimeoutError:
-            for packet_id in set(range(whole.trailer_id + 1)) - set(got):
-                client.resend(1, packet_id, packet_id)
-    np.testing.assert_array_equal(image_of([got[packet_id] for packet_id in sorted(got)]), expected(0.0))
-    assert camera.counts.lost > 10
-    assert camera.counts.resent > 10
-    assert gvsp.RESENT in {packet.status for packet in got.values()}
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from thermostand.drivers.sim.motion.flap import (
     ERROR_SOFT_OVER_CURRENT,
     FakeFlap,
 )
-from thermostand.drivers.sim.usb import Stall, TimedOut
+from thermostand.drivers.sim.usb import Stall
 from thermostand.foundation.clock import FollowedClock, seconds_ns
 
 T0 = 1_700_000_000_000_000_000
@@ -212,22 +212,3 @@ def test_anything_else_stalls(
 ) -> None:
     with pytest.raises(Stall):
         bench.flap.control_transfer(request_type, request_number, value, index, length_or_data)
-
-
-def test_transfer_faults_are_switched_by_attributes(bench: Bench) -> None:
-    bench.flap.timeout = True
-    with pytest.raises(TimedOut):
-        bench.target(3_500)
-    bench.flap.timeout, bench.flap.stall = False, True
-    with pytest.raises(Stall):
-        bench.target(3_500)
-    bench.flap.stall, bench.flap.short_read = False, True
-    assert len(bench.flap.control_transfer(0xC0, 0xE5, 0, 0, 0x35)) == 0x35 // 2
-
-
-def test_replugging_gives_a_new_address(bench: Bench) -> None:
-    bench.flap.unplugged = True
-    assert bench.flap.address == 1
-    bench.flap.unplugged = False
-    bench.flap.unplugged = False
-    assert bench.flap.address == 2

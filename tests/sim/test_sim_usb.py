@@ -106,39 +106,10 @@ def test_a_failed_transfer_carries_its_errno(
     assert len(device.ctrl_transfer(0xC0, 0xE5, 0, 0, 53)) == 4
 
 
-def test_an_unplugged_device_is_gone_and_its_handle_stays_dead_after_replugging(
-    backend: ForwardingBackend, echo: Echo
-) -> None:
-    device = only(backend)
-    echo.unplugged = True
-    assert found(backend) == []
-    with pytest.raises(usb.core.USBError) as raised:
-        device.ctrl_transfer(0xC0, 0xE5, 0, 0, 53)
-    assert raised.value.errno == errno.ENODEV
-    echo.unplugged, echo.address = False, 2
-    with pytest.raises(usb.core.USBError) as raised:
-        device.ctrl_transfer(0xC0, 0xE5, 0, 0, 53)
-    assert raised.value.errno == errno.ENODEV
-    assert len(only(backend).ctrl_transfer(0xC0, 0xE5, 0, 0, 53)) == 4
-
-
 def test_an_unknown_string_stalls(backend: ForwardingBackend) -> None:
     with pytest.raises(usb.core.USBError) as raised:
         usb.util.get_string(only(backend), 9)
     assert raised.value.errno == errno.EPIPE
-
-
-def test_without_a_simulator_there_are_no_devices(server: UsbServer) -> None:
-    server.close()
-    assert found(get_backend(f"tcp:127.0.0.1:{server.port}")) == []
-
-
-def test_a_simulator_that_ends_is_a_lost_device(backend: ForwardingBackend, server: UsbServer) -> None:
-    device = only(backend)
-    server.close()
-    with pytest.raises(usb.core.USBError) as raised:
-        device.ctrl_transfer(0xC0, 0xE5, 0, 0, 53)
-    assert raised.value.errno == errno.ENODEV
 
 
 def test_silence_is_a_timeout_and_the_connection_is_not_used_again() -> None:
