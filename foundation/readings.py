@@ -51,7 +51,7 @@ class Reading:
 
 def bad_reading(channel: str, unit: str, time_ns: int, reason: str, cause: Cause = "device") -> Reading:
     """A BAD reading: value NaN, with the reason."""
-    return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason, cause)
+    return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason, cause=cause)
 
 
 TEMPERATURE_IN_DOUBT = "temperature_in_doubt"

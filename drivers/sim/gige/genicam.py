@@ -7,7 +7,7 @@ GigE Vision, those from 0x10000 on are our own. All registers are big endian.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
 from thermostand.drivers.sim.gige.gvsp import PixelFormat
@@ -40,6 +40,7 @@ class Feature:
     category: str | None
     access: Literal["RO", "RW"] = "RW"
     default: float | str = 0
+    _: KW_ONLY
     minimum: float = 0
     maximum: float = 0xFFFFFFFF
     increment: int = 1
@@ -90,7 +91,18 @@ def _device(serial: str) -> tuple[Feature, ...]:
             (("Sensor", 0), ("Mainboard", 1)),
             selects=("DeviceTemperature",),
         ),
-        Feature("DeviceTemperature", "float", 0x10008, "DeviceControl", "RO", 0.0, -60.0, 150.0, unit="C", length=8),
+        Feature(
+            "DeviceTemperature",
+            "float",
+            0x10008,
+            "DeviceControl",
+            "RO",
+            0.0,
+            minimum=-60.0,
+            maximum=150.0,
+            unit="C",
+            length=8,
+        ),
         Feature("DeviceReset", "command", 0x10010, "DeviceControl"),
     )
 
@@ -150,7 +162,16 @@ def _acquisition() -> tuple[Feature, ...]:
         Feature("AcquisitionStop", "command", 0x10208, acquisition),
         Feature("AcquisitionFrameRateEnable", "boolean", 0x1020C, acquisition, maximum=1),
         Feature(
-            "AcquisitionFrameRate", "float", 0x10210, acquisition, "RW", 10.0, 0.01, MAX_RATE_Hz, unit="Hz", length=8
+            "AcquisitionFrameRate",
+            "float",
+            0x10210,
+            acquisition,
+            "RW",
+            10.0,
+            minimum=0.01,
+            maximum=MAX_RATE_Hz,
+            unit="Hz",
+            length=8,
         ),
         _enumeration("TriggerSelector", 0x10218, acquisition, (("FrameStart", 0),), selects=trigger),
         _enumeration("TriggerMode", 0x1021C, acquisition, (("Off", 0), ("On", 1))),
@@ -159,9 +180,20 @@ def _acquisition() -> tuple[Feature, ...]:
         Feature("TriggerSoftware", "command", 0x10228, acquisition),
         _enumeration("ExposureMode", 0x1022C, acquisition, (("Timed", 0),)),
         _enumeration("ExposureAuto", 0x10230, acquisition, (("Off", 0),)),
-        Feature("ExposureTime", "float", 0x10238, acquisition, "RW", 10_000.0, 20.0, 10e6, unit="us", length=8),
+        Feature(
+            "ExposureTime",
+            "float",
+            0x10238,
+            acquisition,
+            "RW",
+            10_000.0,
+            minimum=20.0,
+            maximum=10e6,
+            unit="us",
+            length=8,
+        ),
         _enumeration("GainAuto", 0x10240, analog, (("Off", 0),)),
-        Feature("Gain", "float", 0x10248, analog, "RW", 0.0, 0.0, 24.0, unit="dB", length=8),
+        Feature("Gain", "float", 0x10248, analog, "RW", 0.0, maximum=24.0, unit="dB", length=8),
     )
 
 
@@ -170,7 +202,9 @@ def _transport(payload_bytes: int, stream_port: int) -> tuple[Feature, ...]:
     return (
         Feature("PayloadSize", "integer", 0x10300, transport, "RO", payload_bytes, unit="B"),
         Feature("TLParamsLocked", "integer", 0x10304, transport, maximum=1),
-        Feature("GevHeartbeatTimeout", "integer", 0x0938, transport, "RW", 3000, 500, 60_000, unit="ms"),
+        Feature(
+            "GevHeartbeatTimeout", "integer", 0x0938, transport, "RW", 3000, minimum=500, maximum=60_000, unit="ms"
+        ),
         Feature(
             "GevTimestampTickFrequency",
             "integer",
@@ -194,8 +228,8 @@ def _transport(payload_bytes: int, stream_port: int) -> tuple[Feature, ...]:
             transport,
             "RW",
             1500,
-            220,
-            16112,
+            minimum=220,
+            maximum=16112,
             increment=4,
             unit="B",
             bits=16,
