@@ -1,1 +1,1 @@
-"""Is a session whole, and what can be had of one that is not."""
+"""What can be had of a session that is not whole."""
