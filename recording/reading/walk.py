@@ -1,6 +1,6 @@
 """A segment's bytes, also damaged ones: which records are proven sound, and where none are.
 
-Read by place from the front; what counts as a proof is in recording/format/proof.py, what as a block that was being
+Read by place from the front; what counts as a proof is in `proven`, what as a block that was being
 written in Blocks. Behind a damaged place the walk continues at the next bytes that look like a
 record and prove to be one. Inside sound records nothing is searched, so an MCAP file that is attached is an attachment.
 Chunks that a disk has put into the wrong place count as damage (find_misplaced_chunks).
@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
+from mcap.records import Attachment, Channel, DataEnd, Header, MessageIndex, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from thermostand.foundation.clock import NS_PER_S
@@ -38,15 +38,103 @@ from thermostand.recording.format.mcap_bytes import (
     MESSAGE_INDEX,
     MESSAGE_INDEX_ENTRY,
     RECORD,
+    RECORD_LIMIT_BYTES,
     ChunkHead,
     Source,
+    bytes_of,
+    check_attachment,
     chunk_content,
     chunk_head,
     records,
     stream,
 )
-from thermostand.recording.format.proof import OPCODES, Claim, Contents, claim_of, proven
 from thermostand.recording.format.summary import read_summary
+
+# Whether the bytes of one record prove that they are what the writer wrote.
+#
+# A chunk and an attachment prove themselves by their CRC (our writer always makes one, so a CRC of 0 is a CRC), the
+# records without one by being, byte for byte, what the writer makes of what they say; a message index by its chunk.
+
+
+class ChunkContents(NamedTuple):
+    """What a chunk holds. places: log time and offset of each message, by channel."""
+
+    schemas: list[Schema]
+    channels: list[Channel]
+    messages: Counter[int]
+    places: dict[int, list[tuple[int, int]]]
+
+    def indexes(self) -> set[bytes]:
+        """What the message indexes behind the chunk say."""
+        return {bytes_of(MessageIndex(*each))[RECORD.size :] for each in self.places.items()}
+
+
+class Claim(NamedTuple):
+    """What a record's head says; the length is that of its content."""
+
+    opcode: int
+    length: int
+
+
+def claim_of(head: bytes) -> Claim | None:
+    """What a record's head says it is; None when that is no record of the data section."""
+    if len(head) < RECORD.size:
+        return None
+    opcode, length = RECORD.unpack_from(head)
+    return Claim(opcode, length) if opcode in OPCODES and length <= RECORD_LIMIT_BYTES else None
+
+
+_EXACT: dict[int, type[Header | Metadata | DataEnd]] = {
+    Opcode.HEADER: Header,
+    Opcode.METADATA: Metadata,
+    Opcode.DATA_END: DataEnd,
+}
+OPCODES = {*_EXACT, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT}
+
+
+def proven(opcode: int, content: bytes) -> ChunkContents | Metadata | Attachment | DataEnd | None:
+    """What the record says; one of DAMAGE when it does not prove itself."""
+    if opcode == Opcode.CHUNK:
+        _, data = chunk_content(memoryview(content))
+        return _contents(data)
+    if opcode == Opcode.ATTACHMENT:
+        check_attachment(content)
+        return Attachment.read(stream(content))
+    if opcode == Opcode.MESSAGE_INDEX:
+        _, entries_bytes = MESSAGE_INDEX.unpack_from(content)
+        if len(content) != MESSAGE_INDEX.size + entries_bytes or entries_bytes % MESSAGE_INDEX_ENTRY.size:
+            raise ValueError("a message index is damaged")
+        return None
+    record = _EXACT[opcode].read(stream(content))
+    if bytes_of(record)[RECORD.size :] != content or not _is_text(record):
+        raise ValueError("a record is damaged")
+    return None if isinstance(record, Header) else record
+
+
+def _is_text(record: Header | Metadata | DataEnd) -> bool:
+    """No text has a NUL; a lost block of the disk reads as zeros."""
+    if isinstance(record, Metadata):
+        texts = [record.name, *record.metadata.keys(), *record.metadata.values()]
+        return not any("\0" in text for text in texts)
+    return True
+
+
+def _contents(data: memoryview) -> ChunkContents:
+    contents, offset = ChunkContents([], [], Counter(), {}), 0
+    for opcode, record in records(data):
+        if opcode == Opcode.MESSAGE:
+            channel, _, time_ns, _ = MESSAGE.unpack_from(record)
+            contents.messages[channel] += 1
+            contents.places.setdefault(channel, []).append((time_ns, offset))
+        elif opcode == Opcode.SCHEMA:
+            contents.schemas.append(Schema.read(stream(record)))
+        elif opcode == Opcode.CHANNEL:
+            contents.channels.append(Channel.read(stream(record)))
+        else:
+            raise ValueError(f"a chunk holds a record of kind {opcode}")
+        offset += RECORD.size + len(record)
+    return contents
+
 
 # The CRC-32 of any stretch of a file, without reading the stretch each time.
 #
@@ -395,7 +483,7 @@ class _Proven(NamedTuple):
 
     begin: int
     end: int
-    content: Contents | Metadata | Attachment | DataEnd | None
+    content: ChunkContents | Metadata | Attachment | DataEnd | None
     chunk: ChunkHead | None = None
 
 
@@ -506,7 +594,7 @@ class _Walk:
     def _take(self, record: _Proven) -> None:
         found = self.found
         match record.content:
-            case Contents(schemas, channels, messages) as contents:
+            case ChunkContents(schemas, channels, messages) as contents:
                 self._indexes = contents.indexes()
                 if not found.chunks:
                     found.is_opening_whole = found.session is not None and not found.damages

@@ -26,8 +26,7 @@ from thermostand.recording.format.images import (
 from thermostand.recording.format.layout import FRAMES, SEQUENCE_MASK
 from thermostand.recording.format.messages import decode_frame_meta
 from thermostand.recording.format.restarts import restarted_step
-from thermostand.recording.writing.home import FolderLost
-from thermostand.recording.writing.homes import FolderContents, Homes
+from thermostand.recording.writing.homes import FolderContents, FolderLost, Homes
 from thermostand.recording.writing.notices import Losses
 from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.recording.writing.segment import MessageRecord

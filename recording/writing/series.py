@@ -18,7 +18,7 @@ from thermostand.recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
 from thermostand.recording.format.manifest import Sealed
 from thermostand.recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, DiskProcess
 from thermostand.recording.writing.forms import SessionForm
-from thermostand.recording.writing.home import Home
+from thermostand.recording.writing.homes import Home
 from thermostand.recording.writing.manifest_file import ManifestFile
 from thermostand.recording.writing.notices import SpaceWatch
 from thermostand.recording.writing.segment import CommitSink, MessageRecord, Segment, SeriesForm

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType
 from tests.recording.disks import ext4, limit_files, run, tmpfs
 from thermostand.recording.format.layout import segment_metadata
 from thermostand.recording.format.messages import CLASSES, EVENT, LOG
-from thermostand.recording.writing.home import FolderLost
+from thermostand.recording.writing.homes import FolderLost
 from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic, merge_chunks
 from thermostand.recording.writing.series import Series, next_number
 

@@ -33,7 +33,7 @@ from thermostand.recording.format.journal_lines import (
 )
 from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.writing.disk import JOURNAL_LINE, DiskProcess
-from thermostand.recording.writing.home import FolderLost
+from thermostand.recording.writing.homes import FolderLost
 from thermostand.recording.writing.locks import lock
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import HELD, IN_WORDS, INTERLOCK, RELEASED, STOPPING
