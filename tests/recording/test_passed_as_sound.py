@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -217,6 +218,12 @@ CASES = {
         Files.DAMAGED, JOURNAL_NAME, True,
     ),
     "the journal removed": (lambda s: (s / JOURNAL_NAME).unlink(), Files.INCOMPLETE, JOURNAL_NAME, True),
+    "a pipe for the journal": (
+        lambda s: ((s / JOURNAL_NAME).unlink(), os.mkfifo(s / JOURNAL_NAME)), Files.INCOMPLETE, JOURNAL_NAME, True
+    ),
+    "a pipe for the manifest": (
+        lambda s: ((s / MANIFEST_NAME).unlink(), os.mkfifo(s / MANIFEST_NAME)), Files.DAMAGED, MANIFEST_NAME, True
+    ),
     "the manifest removed": (lambda s: (s / MANIFEST_NAME).unlink(), Files.INCOMPLETE, MANIFEST_NAME, True),
     "the manifest empty": (lambda s: (s / MANIFEST_NAME).write_bytes(b""), Files.DAMAGED, MANIFEST_NAME, True),
     "the manifest of another session": (
