@@ -9,8 +9,8 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
+from thermostand.stand.commands.remedies import troubleshooting
 from thermostand.stand.config.reference import reference
-from thermostand.stand.watching.remedies import troubleshooting
 
 _PAGES = {
     "stand": "A stand's file",

@@ -45,14 +45,14 @@ _LOADED = {
     ),
     "tests.torture.product": ("thermostand.stand.commands.run_cli", *_INTERFACE),
     "tests.code": (
-        "thermostand.stand.run",
-        "thermostand.stand.queueing.queue_work",
+        "thermostand.stand.service.run",
+        "thermostand.stand.service.queue_work",
         "thermostand.stand.serving.api.server",
         *_INTERFACE,
     ),
     "thermostand.recording.writing.disk": (
         "thermostand.recording.writing.recorder",
-        "thermostand.stand.queueing.queue_work",
+        "thermostand.stand.service.queue_work",
     ),
     "thermostand.stand.serving.preview_process": (
         "thermostand.stand.serving.preview",

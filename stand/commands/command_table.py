@@ -19,7 +19,7 @@ def _verbs() -> dict[str, Lazy]:
     """The commands of the stand's service that have a verb, from its source: to import it takes longer than the list
     may."""
     found: dict[str, Lazy] = {}
-    tree = ast.parse((Path(__file__).parents[1] / "service.py").read_bytes())
+    tree = ast.parse((Path(__file__).parents[1] / "service" / "stand_service.py").read_bytes())
     for method in (each for each in ast.walk(tree) if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)):
         for mark in (each for each in method.decorator_list if isinstance(each, ast.Call)):
             settings = {each.arg: ast.unparse(each.value) for each in mark.keywords}

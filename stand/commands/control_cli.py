@@ -17,6 +17,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.instants import duration, local_text
 from thermostand.foundation.output import output, show
 from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.moment import SET_POINT, heat_by_hand, not_yet_safe
 from thermostand.stand.commands.reached import (
     ConfigOption,
     DirectoryArgument,
@@ -25,15 +26,14 @@ from thermostand.stand.commands.reached import (
     on_stand,
     reached,
 )
+from thermostand.stand.commands.remedies import next_command
 from thermostand.stand.commands.sessions.session_text import size
 from thermostand.stand.commands.verbs import order
 from thermostand.stand.gate import ENDINGS, HELD, INTERLOCK, STOPPING
 from thermostand.stand.latch import LatchedFault
-from thermostand.stand.service import held_text
+from thermostand.stand.service.stand_service import held_text
 from thermostand.stand.serving.client import API, Answer, Server
 from thermostand.stand.serving.desk import FaultState, RunStatus, StandState
-from thermostand.stand.watching.moment import SET_POINT, heat_by_hand, not_yet_safe
-from thermostand.stand.watching.remedies import next_command
 
 app = App()
 
@@ -78,8 +78,8 @@ def watch(server: Server) -> None:
 
     Example: stand watch
     """
-    from thermostand.stand.watching.live import view
-    from thermostand.stand.watching.moment import There
+    from thermostand.stand.commands.live import view
+    from thermostand.stand.commands.moment import There
 
     there = There(server)
     with suppress(KeyboardInterrupt):

@@ -79,7 +79,7 @@ def _by_daemon(server: Server, name: str, verb: str, arguments: dict[str, object
 def _without_daemon(config: str, name: str, verb: str, arguments: dict[str, object], out: Path | None) -> None:
     # Opening devices takes half a second of imports, which a client of the daemon need not wait for.
     from thermostand.stand.config.stand_config import load_config, packaged
-    from thermostand.stand.daemon.hands_on import by_hand, known_devices
+    from thermostand.stand.service.hands_on import by_hand, known_devices
 
     stand = load_config(packaged("", config))
     others = ", ".join(map(str, running_sessions()))

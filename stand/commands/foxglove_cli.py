@@ -28,14 +28,14 @@ def foxglove(
     Example: stand foxglove
     """
     try:
-        from thermostand.stand.watching.foxglove_live import HOST, Published
+        from thermostand.stand.commands.foxglove_live import HOST, FoxgloveServer
     except ModuleNotFoundError as error:
         raise ConfigError("it needs foxglove-sdk: pip install 'thermostand[foxglove]'") from error
-    from thermostand.stand.watching.moment import There
+    from thermostand.stand.commands.moment import There
 
     there = There(server)
     try:
-        published = Published(server.state().stand, port)
+        published = FoxgloveServer(server.state().stand, port)
     except (OSError, RuntimeError) as error:
         raise ConfigError(f"--port {port}: cannot listen at {HOST} ({error})") from error
     typer.echo(f"ws://{HOST}:{port}; Ctrl-C ends it", err=True)

@@ -9,7 +9,7 @@ from thermostand.foundation.output import say, show
 from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.reached import on_stand
 from thermostand.stand.commands.verbs import app_of
-from thermostand.stand.service import StandService
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.client import Server
 from thermostand.stand.serving.desk import QueuedRun
 

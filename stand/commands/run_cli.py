@@ -19,20 +19,20 @@ from thermostand.foundation.output import output, say, show
 from thermostand.foundation.usage import failed
 from thermostand.recording.repair.salvage import salvage_line
 from thermostand.stand.commands.checked_cli import warn_unchecked
+from thermostand.stand.commands.live import followed
 from thermostand.stand.commands.reached import ConfigOption, RecipeArgument, TokenOption, UrlOption
 from thermostand.stand.commands.submitted import daemon_of, follow, submit, submit_recipe, submit_resumed
 from thermostand.stand.config.checked import load_checked
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.estimating.learned import learn
 from thermostand.stand.estimating.run_estimate import existing, price_night, small_disk
-from thermostand.stand.run import resume, run_real, run_virtual
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.resume import interruption, is_of_virtual_time
 from thermostand.stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
+from thermostand.stand.service.run import resume, run_real, run_virtual
 from thermostand.stand.serving.client import Server, server_at
 from thermostand.stand.serving.desk import QueuedRun
 from thermostand.stand.serving.front import interface_of
-from thermostand.stand.watching.live import followed
 
 app = App()
 

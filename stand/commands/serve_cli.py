@@ -22,17 +22,17 @@ from thermostand.foundation.items import Event, Item
 from thermostand.foundation.output import Output, json_line, output, say
 from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.checked_cli import warn_unchecked
+from thermostand.stand.commands.live import aside
 from thermostand.stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
+from thermostand.stand.commands.remedies import next_command
 from thermostand.stand.config.checked import ATTACHMENT, load_checked
 from thermostand.stand.config.interface_section import TokenFile, load_tokens
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.order import optics_texts
-from thermostand.stand.service import StandService
+from thermostand.stand.service.serve import serve as serve_stand
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.access import TokenBook
 from thermostand.stand.serving.front import HERE, front, interface_of
-from thermostand.stand.watching.live import aside
-from thermostand.stand.watching.remedies import next_command
 
 # SIGHUP to a daemon: its tokens are read again. From a terminal that is closed it ends the daemon, as SIGTERM does.
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from thermostand.foundation.errors import ConfigError, Interrupted, SessionError, StandError
+from thermostand.stand.commands.live import View, view
+from thermostand.stand.commands.moment import ShownMoment, There
 from thermostand.stand.commands.verbs import order, recipe_of
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.opening.claim import daemon_pid
@@ -17,8 +19,6 @@ from thermostand.stand.running.order import Order
 from thermostand.stand.serving.client import Server
 from thermostand.stand.serving.desk import QueuedRun, StandState
 from thermostand.stand.serving.presence import living
-from thermostand.stand.watching.live import View, view
-from thermostand.stand.watching.moment import Moment, There
 
 _LOOK_S = 0.5
 _LOST_LIMIT_S = 60.0  # a daemon that does not answer for so long is not followed any more
@@ -122,7 +122,7 @@ class _Follower:
             raise Interrupted(f"run {self._run.id} was taken out of the queue; nothing was started")
         order(self._server, "stop")
 
-    def _waiting(self, state: StandState, moment: Moment) -> Moment:
+    def _waiting(self, state: StandState, moment: ShownMoment) -> ShownMoment:
         ahead = sum(each.state in ("waiting", "running", "interrupted") for each in state.queue) - 1
         why = state.queue_halted or f"{ahead} others are before it"
         return replace(moment, doing=f"{moment.doing}; run {self._run.id} waits: {why}")

@@ -17,7 +17,7 @@ from thermostand.foundation.documents import read_document
 from thermostand.foundation.output import show
 from thermostand.foundation.usage import one_line
 from thermostand.stand.commands.reached import OPTIONS, DirectoryArgument, reached
-from thermostand.stand.service import StandService
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.client import API, Answer, Server
 from thermostand.stand.serving.commands import STOP, Command, Served, Typed, commands_of
 from thermostand.stand.serving.desk import Done

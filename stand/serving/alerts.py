@@ -34,7 +34,7 @@ _HOUR_NS = seconds_ns(3600)
 _BAD: frozenset[AlertCause] = frozenset({"trip", "hold", "device_lost", "disk"})
 
 
-class Message(NamedTuple):
+class AlertMessage(NamedTuple):
     """What is sent."""
 
     cause: AlertCause
@@ -64,7 +64,7 @@ class AlertBook:
         """Nothing is wrong; may be asked from another thread."""
         return not any(cause in _BAD and key != "nearly full" for cause, key in tuple(self._open))
 
-    def receive(self, event: Event, now_ns: int) -> list[Message]:
+    def receive(self, event: Event, now_ns: int) -> list[AlertMessage]:
         """What is to be sent at once."""
         alert = alert_of(event)
         if alert is None:
@@ -87,7 +87,7 @@ class AlertBook:
         self._open[alert.cause, alert.key] = (event, is_due)
         return self._limited([(alert.cause, TITLES[alert.cause], event.text)] if is_due else [], now_ns)
 
-    def due(self, now_ns: int) -> list[Message]:
+    def due(self, now_ns: int) -> list[AlertMessage]:
         """What has lasted for the grace time by now."""
         found: list[tuple[AlertCause, str, str]] = []
         for (cause, key), (event, was_sent) in self._open.items():
@@ -96,9 +96,9 @@ class AlertBook:
                 found.append((cause, TITLES[cause], event.text))
         return self._limited(found, now_ns)
 
-    def _limited(self, found: Iterable[tuple[AlertCause, str, str]], now_ns: int) -> list[Message]:
+    def _limited(self, found: Iterable[tuple[AlertCause, str, str]], now_ns: int) -> list[AlertMessage]:
         """Those that are wanted, and within what an hour may have."""
-        messages: list[Message] = []
+        messages: list[AlertMessage] = []
         while self._sent_ns and now_ns - self._sent_ns[0] >= _HOUR_NS:
             self._sent_ns.popleft()
         for cause, title, text in found:
@@ -110,7 +110,7 @@ class AlertBook:
             more = f"\n{self._left_out} messages before this one were left out" if self._left_out else ""
             self._left_out = 0
             self._sent_ns.append(now_ns)
-            messages.append(Message(cause, f"{self.name}: {title}", f"{text}{more}"))
+            messages.append(AlertMessage(cause, f"{self.name}: {title}", f"{text}{more}"))
         return messages
 
 
@@ -163,7 +163,7 @@ class _Waiting:
     """A message to be sent, not before at_ns (of the time since boot). tried: how often it was; only: the numbers of
     those that have not taken it, () for all."""
 
-    message: Message
+    message: AlertMessage
     at_ns: int = 0
     tried: int = 0
     only: tuple[int, ...] = ()

@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.files import unreadable
 from thermostand.stand.serving.desk import StandState
-from thermostand.stand.serving.presence import STOP_SUFFIX, Daemon, address_in, living, opened_folder
+from thermostand.stand.serving.presence import STOP_SUFFIX, LiveDaemon, address_in, living, opened_folder
 
 API = "/api/v1"
 LIMIT_S = 5.0
@@ -207,7 +207,7 @@ def running_sessions(root: Path | None = None) -> list[Path]:
     return sorted(here)
 
 
-def _named(session: Path, daemons: list[Daemon]) -> list[Daemon]:
+def _named(session: Path, daemons: list[LiveDaemon]) -> list[LiveDaemon]:
     """Those that run `session`, by its name, else by the folder that has this name now."""
     paths = _spellings(session)
     named = [daemon for daemon in daemons if not paths.isdisjoint(_paths(daemon))]
@@ -218,7 +218,7 @@ def _named(session: Path, daemons: list[Daemon]) -> list[Daemon]:
     return same or named
 
 
-def _paths(daemon: Daemon) -> set[str]:
+def _paths(daemon: LiveDaemon) -> set[str]:
     return {daemon.entry.session, daemon.entry.real_path} - {""}
 
 

@@ -19,7 +19,7 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.recording.format.layout import TELEMETRY
 from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
-from thermostand.stand.serving.api.recorded import Disk, SessionName, session_in
+from thermostand.stand.serving.api.recorded import RecordedDisk, SessionName, session_in
 from thermostand.stand.serving.api.stream import json_of
 from thermostand.stand.serving.desk import Missing
 from thermostand.stand.serving.live_history import MOST_POINTS
@@ -104,7 +104,7 @@ class PageRoom:
 
     def __init__(self, viewing: Viewing) -> None:
         self._viewing = viewing
-        self._disk = Disk()
+        self._disk = RecordedDisk()
         self._read_already: dict[tuple[object, ...], Any] = {}
         self._running: asyncio.Task[None] | None = None
 

@@ -33,7 +33,7 @@ _SOCKETS = (".sock", STOP_SUFFIX)
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class DaemonEntry:
     """session: its folder's path when the run began. real_path: the same without symbolic links, and identity: its
     device and inode, once the disk has given them."""
 
@@ -45,17 +45,17 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Daemon:
+class LiveDaemon:
     """A living daemon and where it answers."""
 
-    entry: Entry
+    entry: DaemonEntry
     socket: Path
 
 
 class Presence:
     """A daemon's own entry and sockets; `appear` before anything else. To be used from any thread."""
 
-    def __init__(self, entry: Entry) -> None:
+    def __init__(self, entry: DaemonEntry) -> None:
         self._lock = threading.RLock()
         self._entry = entry
         self._id = f"{entry.pid}-{secrets.token_hex(4)}"
@@ -89,7 +89,7 @@ class Presence:
             )
         return False
 
-    def tell(self, entry: Entry) -> None:
+    def tell(self, entry: DaemonEntry) -> None:
         """Say this from now on."""
         with self._lock, suppress(OSError):  # what was said before stays
             self._entry = entry
@@ -133,7 +133,7 @@ class Presence:
             os.close(before)
 
 
-def living() -> list[Daemon]:
+def living() -> list[LiveDaemon]:
     """Every daemon of this user on this machine, in the order of their processes; what dead ones left is removed."""
     found = [
         daemon
@@ -174,7 +174,7 @@ def _listening(path: Path) -> socket.socket:
     return listening
 
 
-def _living(path: Path) -> Daemon | None:
+def _living(path: Path) -> LiveDaemon | None:
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:  # gone meanwhile
@@ -187,17 +187,17 @@ def _living(path: Path) -> Daemon | None:
                 path.unlink(missing_ok=True)
             return None
         with open(file, "rb", closefd=False) as opened:
-            return Daemon(_decoded(opened.read()), path.with_suffix(".sock"))
+            return LiveDaemon(_decoded(opened.read()), path.with_suffix(".sock"))
     except (OSError, ValueError, LookupError, TypeError):  # nothing of ours
         return None
     finally:
         os.close(file)
 
 
-def _decoded(content: bytes) -> Entry:
+def _decoded(content: bytes) -> DaemonEntry:
     fields = cast("dict[str, object]", json.loads(content))
     identity = cast("list[int] | None", fields["identity"])
-    return Entry(
+    return DaemonEntry(
         str(fields["session"]),
         int(str(fields["pid"])),
         str(fields["stand"]),

@@ -19,7 +19,7 @@ from thermostand.markers.detection import Detection, detect, grey_image
 from thermostand.markers.edge_model import SIGMA
 from thermostand.markers.plane import project, roll_deg
 from thermostand.markers.target import Target
-from thermostand.stand.serving.shot import DRIFT_ROLES, Image, Shot
+from thermostand.stand.serving.shot import DRIFT_ROLES, FrameShot, Image
 
 _JPEG_QUALITY = 80
 _BINS = 64
@@ -81,7 +81,7 @@ class Previewer:
         self._before: dict[str, Detection] = {}
         self._reference: dict[str, tuple[int, Float]] = {}
 
-    def look(self, shot: Shot) -> Preview:
+    def look(self, shot: FrameShot) -> Preview:
         """What there is to see in a frame; one without the target has no markers and says why."""
         grey = grey_image(shot.image)
         height, width = grey.shape
@@ -115,7 +115,7 @@ class Previewer:
             jpeg=jpeg,
         )
 
-    def _drift(self, shot: Shot, found: Detection) -> Float:
+    def _drift(self, shot: FrameShot, found: Detection) -> Float:
         """Of each marker, px; NaN where it is unknown."""
         if shot.role not in DRIFT_ROLES:
             return np.full_like(found.centres_px, np.nan)

@@ -14,7 +14,7 @@ from thermostand.foundation.documents import parse_document
 from thermostand.markers.target import Target
 from thermostand.recording.reading.session import Session
 from thermostand.stand.serving.preview import Previewer
-from thermostand.stand.serving.shot import DRIFT_ROLES, Shot, is_reference
+from thermostand.stand.serving.shot import DRIFT_ROLES, FrameShot, is_reference
 
 MOST_FRAMES = 120
 
@@ -41,7 +41,7 @@ class SessionDrift:
 class Recalled:
     """Of one camera of an interrupted run: the frame that drift counts from, and the role of its last frame."""
 
-    shot: Shot
+    shot: FrameShot
     last_role: str
 
 
@@ -59,7 +59,7 @@ def run_references(path: Path | str) -> tuple[Recalled, ...]:
             before = role
         if reference is not None:
             frame = session.frame(reference)
-            shot = Shot(camera, frame.time_ns, frame.image, str(table.role[reference]), as_reference=True)
+            shot = FrameShot(camera, frame.time_ns, frame.image, str(table.role[reference]), as_reference=True)
             found.append(Recalled(shot, before))
     return tuple(found)
 
@@ -86,7 +86,7 @@ def session_drift(path: Path | str, target_text: str) -> SessionDrift:
     points: list[DriftPoint] = []
     for index in (reference, *chosen.tolist()):
         frame = session.frame(index)
-        seen = previewer.look(Shot(camera, frame.time_ns, frame.image, str(table.role[index]), not points))
+        seen = previewer.look(FrameShot(camera, frame.time_ns, frame.image, str(table.role[index]), not points))
         if seen.mean_px is not None and seen.worst_px is not None:
             points.append(DriftPoint(frame.time_ns, seen.mean_px, seen.worst_px))
         trouble = trouble or seen.trouble

@@ -17,7 +17,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class FrameShot:
     """role: of its capture, "" without one. as_reference: drift counts from it on."""
 
     camera: str

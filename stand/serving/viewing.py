@@ -24,7 +24,7 @@ from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.stand.serving.live_history import History
 from thermostand.stand.serving.preview_process import MODULE, previewer, recorded_week, run_references
-from thermostand.stand.serving.shot import Shot, is_reference
+from thermostand.stand.serving.shot import FrameShot, is_reference
 
 if TYPE_CHECKING:
     from thermostand.stand.serving.preview import Preview
@@ -152,7 +152,7 @@ class Viewing:
             if self._has_to_recall:
                 await self._recall(line)
             as_reference = is_reference(role, self._roles_seen.get(camera, ""), is_first=camera in self._fresh)
-            shot = Shot(camera, frame.time_ns, frame.image, role, as_reference)
+            shot = FrameShot(camera, frame.time_ns, frame.image, role, as_reference)
             preview: Preview = await asyncio.to_thread(line.call, "previewer", "look", shot)
         except OSError as error:
             await self._has_ended(str(error))

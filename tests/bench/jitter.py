@@ -24,8 +24,8 @@ from thermostand.foundation.clock import WallClock, seconds_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
-from thermostand.stand.run import run_real
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_real
 from thermostand.stand.simulator import Simulator, laboratory_of
 
 FRAMES = 101  # so that the 99th percentile is not the longest

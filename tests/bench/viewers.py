@@ -24,7 +24,7 @@ from tests.system.simulated_orders import simulated_order
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.opening.stop import Interrupted, Stop
-from thermostand.stand.service import StandService
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve
 from thermostand.stand.serving.client import Server, server_of

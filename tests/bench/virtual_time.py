@@ -18,8 +18,8 @@ from tests.system.simulated_orders import simulated_order
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
-from thermostand.stand.run import one_cpu, run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import one_cpu, run_virtual
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 ROUNDS = 5

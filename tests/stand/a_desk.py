@@ -20,7 +20,7 @@ from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.gate import INTERLOCK, OPERATOR, Gate
 from thermostand.stand.running.course import check_edit
 from thermostand.stand.running.memory.state import RunState
-from thermostand.stand.service import (
+from thermostand.stand.service.stand_service import (
     CancelRequest,
     DeviceRequest,
     ExtendRequest,

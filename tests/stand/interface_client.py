@@ -4,10 +4,10 @@ from pathlib import Path
 
 from tests.asking import ask
 from thermostand.foundation.errors import SessionError
-from thermostand.stand.serving.presence import Entry, living
+from thermostand.stand.serving.presence import DaemonEntry, living
 
 
-def entries_of(session: Path) -> list[Entry]:
+def entries_of(session: Path) -> list[DaemonEntry]:
     """What the daemons that run `session` say of themselves; on this machine there may be others."""
     return [each.entry for each in living() if each.entry.session == str(session)]
 

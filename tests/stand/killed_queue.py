@@ -12,8 +12,8 @@ from typing import NoReturn
 from thermostand.foundation.clock import Now, WallClock
 from thermostand.foundation.patience import Patience
 from thermostand.recording.writing.disk import QUEUE_LINE, DiskCalls, DiskProcess
-from thermostand.stand.queueing.queue_file import Entry, working
-from thermostand.stand.queueing.queue_work import Notes, RunOne, drain
+from thermostand.stand.service.queue_file import QueueEntry, working
+from thermostand.stand.service.queue_work import RunNotes, RunOne, drain
 
 
 async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None]) -> None:
@@ -28,7 +28,7 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
         disk.close()
 
 
-async def run(entry: Entry, notes: Notes) -> NoReturn:
+async def run(entry: QueueEntry, notes: RunNotes) -> NoReturn:
     await notes.begun(Path(sys.argv[1]) / "night")
     for _ in range(int(sys.argv[2])):
         notes.step_done()

@@ -25,7 +25,7 @@ from thermostand.stand.gate import INTERLOCK, OPERATOR
 from thermostand.stand.running.course import check_edit
 from thermostand.stand.running.memory.entries import Step as StepMarked
 from thermostand.stand.running.memory.fold import fold
-from thermostand.stand.service import ExtendRequest, PauseRequest, SkipRequest
+from thermostand.stand.service.stand_service import ExtendRequest, PauseRequest, SkipRequest
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.desk import (
     Argument,

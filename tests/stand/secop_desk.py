@@ -10,7 +10,7 @@ from tests.stand.a_desk import ADesk, served
 from thermostand.foundation.errors import DeviceFault, Refused, Unreachable
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.stand.service import DeviceRequest
+from thermostand.stand.service.stand_service import DeviceRequest
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.desk import (
     Argument,

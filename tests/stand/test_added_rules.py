@@ -17,7 +17,7 @@ from thermostand.foundation.readings import Reading
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.stand_config import StandConfig, packaged
 from thermostand.stand.fault import Fault
-from thermostand.stand.watching.remedies import next_command, troubleshooting
+from thermostand.stand.commands.remedies import next_command, troubleshooting
 
 MODULE = """
 from pydantic import Field

@@ -18,8 +18,8 @@ from thermostand.foundation.items import Event
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.alerts_section import AlertsConfig, load_secrets
 from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.run import run_real
 from thermostand.stand.running.order import load_order
+from thermostand.stand.service.run import run_real
 from thermostand.stand.serving import alerts as module
 from thermostand.stand.serving.alerts import alerting
 from thermostand.stand.serving.alerts_process import deliver, ping

@@ -15,11 +15,11 @@ from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.daemon import systemd
-from thermostand.stand.daemon.daemon_file import Counters, Kept, KeptFile, kept_in
-from thermostand.stand.daemon.serve import Reports
-from thermostand.stand.queueing.orders import Orders
 from thermostand.stand.running.opening.open_stand import OpenStand
+from thermostand.stand.service import systemd
+from thermostand.stand.service.daemon_file import Counters, KeptCounters, KeptFile, kept_in
+from thermostand.stand.service.orders import Orders
+from thermostand.stand.service.serve import Reports
 from thermostand.stand.serving.desk import Conflict, RunRequest, Who
 
 
@@ -61,16 +61,16 @@ def test_what_was_not_read_is_not_counted():
 
 async def test_counters_are_there_for_the_next_daemon(tmp_path: Path):
     kept = KeptFile(tmp_path, lambda function, *arguments: function(*arguments), Hub(), WallClock())
-    last = Kept(counters={"flap_cycles": 3.0})
-    kept.note(Kept(counters={"flap_cycles": 1.0}))
+    last = KeptCounters(counters={"flap_cycles": 3.0})
+    kept.note(KeptCounters(counters={"flap_cycles": 1.0}))
     kept.note(last)
     await kept.close(Patience())
     assert kept_in(tmp_path) == (last, "")
     (tmp_path / "daemon.json").write_text("{")
     found, damage = kept_in(tmp_path)  # a damaged file is no reason not to open a stand
-    assert (found, "the counters begin again at 0" in damage) == (Kept(), True)
+    assert (found, "the counters begin again at 0" in damage) == (KeptCounters(), True)
     assert (tmp_path / "daemon.json.damaged").read_text() == "{"
-    assert kept_in(tmp_path / "nowhere") == (Kept(), "")
+    assert kept_in(tmp_path / "nowhere") == (KeptCounters(), "")
 
 
 async def test_a_disk_that_refuses_is_an_event(tmp_path: Path):
@@ -80,7 +80,7 @@ async def test_a_disk_that_refuses_is_an_event(tmp_path: Path):
     hub, events = Hub(), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     kept = KeptFile(tmp_path, refused, hub, WallClock())
-    kept.note(Kept())
+    kept.note(KeptCounters())
     await kept.close(Patience())
     assert [event.kind for event in events] == ["daemon_not_kept"]
 

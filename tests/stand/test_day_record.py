@@ -21,7 +21,7 @@ from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.daemon.day_record import DayRecord, remove_idle_logs
+from thermostand.stand.service.day_record import DayRecord, remove_idle_logs
 
 CONFIG = packaged("", "simulated")
 

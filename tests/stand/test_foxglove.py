@@ -14,7 +14,7 @@ from tests.addresses import free_port
 from thermostand.foundation.readings import Quality
 from thermostand.stand.serving.desk import HeatByHand, ReadingState, StandState
 
-live = pytest.importorskip("thermostand.stand.watching.foxglove_live")
+live = pytest.importorskip("thermostand.stand.commands.foxglove_live")
 NOW_NS = 1_795_000_000_000_000_000
 UTC_NS = 5_000_000_000
 _DATA = struct.Struct("<BIQ")  # opcode, subscription, time

@@ -19,7 +19,7 @@ from tests.stand.interface_client import DAEMON, entries_of, obeys
 from thermostand.foundation.errors import SessionError
 from thermostand.stand.serving import presence as runtime
 from thermostand.stand.serving.client import running_sessions, server_of
-from thermostand.stand.serving.presence import Entry, Presence
+from thermostand.stand.serving.presence import DaemonEntry, Presence
 
 
 async def folder_stated(session: Path) -> None:
@@ -180,7 +180,7 @@ async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: byt
         writer.write(said)
         writer.close()
 
-    presence = Presence(Entry(str(tmp_path), os.getpid(), STAND))
+    presence = Presence(DaemonEntry(str(tmp_path), os.getpid(), STAND))
     try:
         everything, stop = presence.appear()
         stop.close()

@@ -18,10 +18,10 @@ from thermostand.foundation.patience import BUDGET_S, LEAST_S, Patience
 from thermostand.recording.writing.disk import FILES_LINE, QUEUE_LINE, DiskCalls, DiskProcess
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from thermostand.stand.chamber.compressor import CompressorFile, CompressorState
-from thermostand.stand.daemon.daemon_file import Kept, KeptFile
-from thermostand.stand.queueing.queue import append
-from thermostand.stand.queueing.queue_file import Entry
-from thermostand.stand.queueing.queue_work import Notes, drain
+from thermostand.stand.service.daemon_file import KeptCounters, KeptFile
+from thermostand.stand.service.queue import append
+from thermostand.stand.service.queue_file import QueueEntry
+from thermostand.stand.service.queue_work import RunNotes, drain
 from thermostand.stand.running.memory.entries import Begun, Ended
 from thermostand.stand.running.memory.journal import Journal, Logbook
 from thermostand.stand.running.memory.state import RunState
@@ -115,13 +115,13 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
         log, journal = Logbook(hub, clock, RunState(())), Journal.create(recorder.directory)
         await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
         queue, reported = DiskCalls(own, QUEUE_LINE, clock), []
-        entry = Entry(id=1, recipe="r", config="c", config_text="", recipe_text="", target_text="", added_ns=1)
+        entry = QueueEntry(id=1, recipe="r", config="c", config_text="", recipe_text="", target_text="", added_ns=1)
         await queue.call(append, tmp_path, entry)
         kept = KeptFile(tmp_path, own.line(FILES_LINE).run, hub, clock)
         compressor = CompressorFile(tmp_path / "compressor.json", hub, clock)
         compressor.through(own.line(FILES_LINE).run)
 
-        async def run_one(_: Entry, __: Notes) -> Path:
+        async def run_one(_: QueueEntry, __: RunNotes) -> Path:
             for each in (disk, own):
                 os.kill(each.pid, signal.SIGSTOP)
             hung()
@@ -140,7 +140,7 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
         try:
             with pytest.raises(Interrupted):
                 await drain(tmp_path, run_one, clock, reported.append, queue, stop.patience)
-            kept.note(Kept())
+            kept.note(KeptCounters())
             await kept.close(stop.patience)
             await compressor.close(stop.patience)
             assert not await own.ended_within(stop.patience)

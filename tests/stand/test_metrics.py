@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.stand.a_desk import ADesk
 from tests.stand.test_interface import STATUS
-from thermostand.stand.serving.api.bridge import Bridge, Snapshot
+from thermostand.stand.serving.api.bridge import Bridge, StateSnapshot
 from thermostand.stand.serving.api.reads import metrics
 from thermostand.stand.serving.desk import FaultState, HeatByHand, QueuedRun
 
@@ -29,7 +29,7 @@ async def page() -> str:
         }
     )
     bridge.close()
-    return metrics(Snapshot(state, bridge.snapshot.at_s), 3, 2)
+    return metrics(StateSnapshot(state, bridge.snapshot.at_s), 3, 2)
 
 
 async def test_every_line_is_of_the_format_and_no_measurement_is_invented():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.stand.run import one_cpu
+from thermostand.stand.service.run import one_cpu
 
 CPUS = "import os; print(sorted(os.sched_getaffinity(0)))"
 
@@ -48,7 +48,7 @@ def test_the_cpus_are_given_back_also_after_an_error():
 
 HOLD = """
 import os, sys
-import thermostand.stand.run as one_cpu
+import thermostand.stand.service.run as one_cpu
 
 one_cpu._CPU_FOLDER = sys.argv[1]  # those of the machine may be taken by others just now
 with one_cpu.one_cpu():

@@ -11,7 +11,7 @@ from tests.compensation.rendered import Scene, photograph, render, true_centres_
 from thermostand.markers.detection import detect
 from thermostand.markers.target import load_target
 from thermostand.stand.serving.preview import Previewer, half_jpeg, keystone_percent, setup_of, tilt_deg
-from thermostand.stand.serving.shot import Shot
+from thermostand.stand.serving.shot import FrameShot
 
 PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
 SMALL = Scene(size=(612, 512), f_px=2193)
@@ -28,7 +28,7 @@ def image_of(scene):
 
 
 def shot(scene, time_ns=1, **kwargs):
-    return Shot("camera", time_ns, image_of(scene), **kwargs)
+    return FrameShot("camera", time_ns, image_of(scene), **kwargs)
 
 
 def test_drift_is_shown_against_the_reference_and_is_the_true_one():
@@ -57,7 +57,7 @@ def test_of_a_target_that_is_moved_on_purpose_no_drift_is_shown():
 
 def test_a_frame_without_the_target_says_why_and_is_shown_all_the_same():
     blank = np.full((512, 612), 90, np.uint8)
-    found = Previewer(PAPER).look(Shot("camera", 1, blank))
+    found = Previewer(PAPER).look(FrameShot("camera", 1, blank))
     assert found.markers == ()
     assert found.trouble
     assert found.setup.histogram[90 // 4] == 1.0

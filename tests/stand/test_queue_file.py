@@ -15,9 +15,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from tests import forked
 from tests.recording.disks import limit_files
 from thermostand.foundation.errors import ConfigError, SessionError, StandTripped
-from thermostand.stand.queueing import queue
-from thermostand.stand.queueing.queue_file import KEPT_ENDED, LAST_NAME, QUEUE_NAME, State, changing, working
 from thermostand.stand.running.order import Order, load_order
+from thermostand.stand.service import queue
+from thermostand.stand.service.queue_file import KEPT_ENDED, LAST_NAME, QUEUE_NAME, QueueState, changing, working
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -100,11 +100,11 @@ class QueueAgainstAList(RuleBasedStateMachine):
         self.running = self.open.pop(0)
         assert entry is not None
         assert entry.id == self.running
-        assert (entry.state is State.INTERRUPTED) == (self.running in self.interrupted)
+        assert (entry.state is QueueState.INTERRUPTED) == (self.running in self.interrupted)
 
     @precondition(lambda self: self.running is not None)
-    @rule(state=st.sampled_from([State.DONE, State.FAILED]))
-    def finish(self, state: State) -> None:
+    @rule(state=st.sampled_from([QueueState.DONE, QueueState.FAILED]))
+    def finish(self, state: QueueState) -> None:
         assert self.running is not None
         queue.finish(self.directory, self.running, state, 3)
         self.ended.append((self.running, state))
@@ -198,7 +198,7 @@ def test_an_interrupted_run_keeps_its_session_and_comes_first(tmp_path: Path):
 def test_of_the_runs_that_have_ended_the_latest_are_kept(tmp_path: Path):
     waiting = add(tmp_path)
     ended = tuple(
-        queue.queued(tmp_path).entries[0].model_copy(update={"id": number, "state": State.DONE})
+        queue.queued(tmp_path).entries[0].model_copy(update={"id": number, "state": QueueState.DONE})
         for number in range(2, KEPT_ENDED + 20)
     )
     with changing(tmp_path) as draft:
@@ -212,7 +212,7 @@ def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
     add(tmp_path)
     with working(tmp_path):
         queue.take(tmp_path, 2)
-        queue.finish(tmp_path, 1, State.FAILED, 3, "air is too warm", halt=True)
+        queue.finish(tmp_path, 1, QueueState.FAILED, 3, "air is too warm", halt=True)
         with pytest.raises(StandTripped, match=r"halted: run 1: air is too warm; remove the cause"):
             queue.take(tmp_path, 4)
         assert states(tmp_path) == [(1, "failed"), (2, "waiting")]
@@ -241,7 +241,7 @@ def test_a_number_that_is_not_there_is_said_to(tmp_path: Path, number: int):
 ADDING = """
 import sys
 from pathlib import Path
-from thermostand.stand.queueing import queue
+from thermostand.stand.service import queue
 from thermostand.stand.running.order import load_order
 order = load_order("warm-up", "simulated")
 print("ready", flush=True)

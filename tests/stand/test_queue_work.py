@@ -12,11 +12,11 @@ from tests import forked
 from tests.stand.killed_queue import work
 from thermostand.foundation.clock import FollowedClock
 from thermostand.foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Unreachable
-from thermostand.stand.queueing import queue
-from thermostand.stand.queueing.queue_file import Entry, working
-from thermostand.stand.queueing.queue_work import MOST_FRUITLESS_STARTS, Halt, Notes, Stopped
 from thermostand.stand.running.opening.stop import Interrupted
 from thermostand.stand.running.order import load_order
+from thermostand.stand.service import queue
+from thermostand.stand.service.queue_file import QueueEntry, working
+from thermostand.stand.service.queue_work import MOST_FRUITLESS_STARTS, Halt, RunNotes, Stopped
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -33,7 +33,7 @@ class Runs:
         for _ in ends:
             queue.append(directory, queue.entry_of(ORDER, "simulated", 1))
 
-    async def run(self, entry: Entry, notes: Notes) -> Path:
+    async def run(self, entry: QueueEntry, notes: RunNotes) -> Path:
         self.seen.append((entry.id, entry.session))
         session = self.directory / f"session-{entry.id}"
         if self.session_first:
@@ -65,7 +65,7 @@ async def test_all_that_is_queued_is_run_in_turn(tmp_path: Path):
 async def test_what_is_added_while_a_run_is_under_way_has_its_turn(tmp_path: Path):
     runs = Runs(tmp_path, None)
 
-    async def run(entry: Entry, notes: Notes) -> Path:
+    async def run(entry: QueueEntry, notes: RunNotes) -> Path:
         if entry.id == 1:
             queue.append(tmp_path, queue.entry_of(ORDER, "simulated", 1))
         return tmp_path / str(entry.id)
@@ -146,7 +146,7 @@ async def test_a_run_that_an_operator_stops_is_resumed_first_next_time(tmp_path:
 async def test_a_queue_that_cannot_be_noted_in_does_not_end_a_run(tmp_path: Path):
     runs = Runs(tmp_path, None)
 
-    async def run(entry: Entry, notes: Notes) -> Path:
+    async def run(entry: QueueEntry, notes: RunNotes) -> Path:
         good = (tmp_path / "queue.json").read_bytes()
         (tmp_path / "queue.json").write_bytes(b"")
         await notes.begun(tmp_path / "night")
@@ -162,11 +162,11 @@ async def test_a_queue_that_cannot_be_reached_keeps_nobody_from_leaving(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Its lock stands for a disk that hangs."""
-    monkeypatch.setattr("thermostand.stand.queueing.queue_work._NOTED_WITHIN_S", 0.1)
+    monkeypatch.setattr("thermostand.stand.service.queue_work._NOTED_WITHIN_S", 0.1)
     runs = Runs(tmp_path, None)
     with (tmp_path / ".queue.lock").open("w") as lock:
 
-        async def run(entry: Entry, notes: Notes) -> Path:
+        async def run(entry: QueueEntry, notes: RunNotes) -> Path:
             fcntl.flock(lock, fcntl.LOCK_EX)
             notes.step_done()
             raise Interrupted("stopped; the stand is safe")

@@ -13,12 +13,12 @@ from tests.stand.test_interface_access import ask, free_port
 from thermostand.stand.serving.api import recorded
 from thermostand.stand.serving.api.bridge import NoAnswer
 from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.api.recorded import REPORT, REPORT_CSP, Disk
+from thermostand.stand.serving.api.recorded import REPORT, REPORT_CSP, RecordedDisk
 
 
 async def test_a_disk_that_hangs_keeps_neither_the_interface_nor_the_process(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorded, "_DISK_LIMIT_S", 0.1)
-    hangs, disk = threading.Event(), Disk()
+    hangs, disk = threading.Event(), RecordedDisk()
     with pytest.raises(NoAnswer, match="the disk has not answered"):
         await disk.ask(lambda: hangs.wait(60))
     assert all(thread.daemon for thread in threading.enumerate() if thread.name == "disk")

@@ -16,9 +16,9 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.repeats import RepeatLimit
 from thermostand.stand import gate
+from thermostand.stand.commands.moment import event_line
+from thermostand.stand.commands.remedies import next_command, troubleshooting
 from thermostand.stand.serving.alerts import AlertBook
-from thermostand.stand.watching.moment import event_line
-from thermostand.stand.watching.remedies import next_command, troubleshooting
 
 ROOT = Path(stand.__file__).parents[1]
 GENERIC = next_command("of a later version", {})

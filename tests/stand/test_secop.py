@@ -11,22 +11,22 @@ from tests.stand.secop_desk import JAM, NO, WIRE, SecopDesk, node
 from tests.stand.secop_talk import talking
 from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.serving.desk import FaultState, HeatByHand
-from thermostand.stand.serving.secop.secop_lines import Request, message, parsed
+from thermostand.stand.serving.secop.secop_lines import SecopRequest, message, parsed
 
 
 @pytest.mark.parametrize(
     ("line", "request_"),
     [
-        (b"*IDN?", Request("*IDN?")),
-        (b"describe\r", Request("describe")),
-        (b"", Request("help")),
-        (b"ping  ", Request("ping", "", "")),
-        (b"read mf:status", Request("read", "mf:status")),
-        (b"change mf:target 12", Request("change", "mf:target", "12")),
-        (b'do t1:setpid {"p": 100.0, "i": 5.0}', Request("do", "t1:setpid", '{"p": 100.0, "i": 5.0}')),
+        (b"*IDN?", SecopRequest("*IDN?")),
+        (b"describe\r", SecopRequest("describe")),
+        (b"", SecopRequest("help")),
+        (b"ping  ", SecopRequest("ping", "", "")),
+        (b"read mf:status", SecopRequest("read", "mf:status")),
+        (b"change mf:target 12", SecopRequest("change", "mf:target", "12")),
+        (b'do t1:setpid {"p": 100.0, "i": 5.0}', SecopRequest("do", "t1:setpid", '{"p": 100.0, "i": 5.0}')),
     ],
 )
-def test_lines_are_split_at_the_first_two_spaces(line: bytes, request_: Request):
+def test_lines_are_split_at_the_first_two_spaces(line: bytes, request_: SecopRequest):
     assert parsed(line) == request_
 
 

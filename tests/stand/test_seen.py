@@ -7,9 +7,9 @@ from thermostand.drivers.devices.relays import NoRelays
 from thermostand.foundation.clock import VirtualClock, seconds_ns
 from thermostand.foundation.errors import Unreachable
 from thermostand.foundation.instants import local_text
+from thermostand.stand.commands.moment import not_yet_safe
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.serving.desk import NotConfirmed, seen_state
-from thermostand.stand.watching.moment import not_yet_safe
 
 BEGIN = f"since {local_text(0)}"
 

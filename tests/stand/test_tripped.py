@@ -30,12 +30,12 @@ from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.fault import Fault, Readings, Watch
 from thermostand.stand.interlock import Interlocked
 from thermostand.stand.latch import UNREADABLE, state_folder
-from thermostand.stand.queueing.host import Host
-from thermostand.stand.run import run_real
 from thermostand.stand.running.opening.claim import latch_file
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.order import load_order
-from thermostand.stand.service import StandService
+from thermostand.stand.service.host import Host
+from thermostand.stand.service.run import run_real
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve
 from thermostand.stand.serving.client import Server, server_at, server_of

@@ -15,7 +15,7 @@ from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.stand.serving.preview import Preview, Setup
 from thermostand.stand.serving.recorded_drift import run_references
-from thermostand.stand.serving.shot import Shot
+from thermostand.stand.serving.shot import FrameShot
 from thermostand.stand.serving.viewing import Viewing
 
 TARGET = (Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml").read_text("utf-8")
@@ -48,7 +48,7 @@ class Looking:
     def __init__(self) -> None:
         self._reference_ns: int | None = None
 
-    def look(self, shot: Shot) -> Preview:
+    def look(self, shot: FrameShot) -> Preview:
         if shot.as_reference or self._reference_ns is None:
             self._reference_ns = shot.time_ns
         setup = Setup((), 0.0, 0.0)

@@ -18,13 +18,13 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import RUN_START
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.stand.commands.control_cli import idle_lines
+from thermostand.stand.commands.live import Foot, PlainLines, RunFollower, panel_lines, plain_line
+from thermostand.stand.commands.moment import ShownMoment, moment_of
+from thermostand.stand.commands.remedies import next_command
 from thermostand.stand.serving.desk import HeatByHand, ReadingState, StandState
-from thermostand.stand.watching.live import Following, Foot, Lines, panel_lines, plain_line
-from thermostand.stand.watching.moment import Moment, moment_of
-from thermostand.stand.watching.remedies import next_command
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S  # 2026-01-01 18:00:00 UTC
-MOMENT = Moment(
+MOMENT = ShownMoment(
     BEGIN_NS,
     "thermal-cycle on a stand",
     share=0.25,
@@ -56,11 +56,11 @@ class Followed:
     """A run of this process as it is shown, whose service is a desk."""
 
     def __init__(self, folder: Path) -> None:
-        self.moments: list[Moment] = []
+        self.moments: list[ShownMoment] = []
         self.lines: list[str] = []
         self.desk = ADesk(run=STATUS)
         self.session = folder / "all nights" / "20260101T180000Z-demo"
-        self.following = Following(self.moments.append, self.lines.append, folder / "all nights")
+        self.following = RunFollower(self.moments.append, self.lines.append, folder / "all nights")
         self.following.watch(self.desk.hub)
         self.desk.hub.publish(RUN_START.at(BEGIN_NS, session=self.session.name, recipe="demo", steps=2, frames=2))
 
@@ -184,7 +184,7 @@ def test_without_a_terminal_a_line_a_minute_and_in_virtual_time_one_at_each_tent
     capsys: pytest.CaptureFixture[str], is_virtual: bool, shares: list[int]
 ):
     clock = SetClock()
-    lines = Lines(clock, is_virtual=is_virtual)
+    lines = PlainLines(clock, is_virtual=is_virtual)
     for second in range(0, 130, 10):
         clock.ns = BEGIN_NS + second * NS_PER_S
         lines.show(replace(MOMENT, share=second / 1200))

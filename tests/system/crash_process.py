@@ -17,9 +17,9 @@ from thermostand.foundation.hub import Hub
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.stand.chamber.compressor import CompressorState, keep
-from thermostand.stand.queueing.queue_file import changing
 from thermostand.stand.running.memory.entries import Begun, Dwell
 from thermostand.stand.running.memory.journal import Journal
+from thermostand.stand.service.queue_file import changing
 
 SESSION, QUEUE, COMPRESSOR, CONTROL = "session", "runs", "state/compressor.json", "control"
 PAUSE_S = 0.005

@@ -25,8 +25,8 @@ from pathlib import Path
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 POLL_s = 1.0
 PROTOCOL = """

@@ -16,8 +16,8 @@ from threading import Timer
 from tests import forked
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.readings import Frame
-from thermostand.stand.run import resume, run_virtual
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import resume, run_virtual
 
 DOWNTIME_S = 45.0
 

@@ -23,10 +23,10 @@ from thermostand.stand import simulator
 from thermostand.stand.assembly import assemble, device_kinds
 from thermostand.stand.commissioning.commissioning import commission
 from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.daemon.hands_on import by_hand, known_devices
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.opening.claim import addresses
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.hands_on import by_hand, known_devices
+from thermostand.stand.service.run import run_virtual
 from thermostand.stand.simulator import Simulator, laboratory_of, relocated
 
 MODULE = '''

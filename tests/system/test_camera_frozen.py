@@ -12,8 +12,8 @@ from tests.system.test_run_ends import break_now
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Quality
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 
 @pytest.fixture(autouse=True)

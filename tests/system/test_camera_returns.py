@@ -12,8 +12,8 @@ from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 
 @pytest.fixture(autouse=True)

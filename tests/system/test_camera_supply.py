@@ -17,10 +17,10 @@ from tests.system.test_run import at_step
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.hub import Hub
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.memory.entries import Dwell
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 RECIPE = """
 name: supply

@@ -20,10 +20,10 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.guarding.rules import camera_measured
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.memory.entries import Again, Step
 from thermostand.stand.running.memory.fold import after, fold
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 CAPTURES = """
 name: captures

@@ -18,8 +18,8 @@ from thermostand.foundation.errors import ConfigError, DeviceFault
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 MAKES = ("espec", "cts", "ascii2")
 NIGHTLY = [pytest.param(make, marks=pytest.mark.nightly) for make in ("simserv", "julabo")]

@@ -22,12 +22,12 @@ from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.executing.actions import cold_start
 from thermostand.stand.running.memory.entries import Step
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import run_virtual
 
 WARM_UP = """
 name: warm

@@ -28,8 +28,8 @@ from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_unfinished
 from thermostand.stand.chamber.compressor import restored
-from thermostand.stand.queueing.queue_file import read_queue
 from thermostand.stand.running.memory.journal import Journal
+from thermostand.stand.service.queue_file import read_queue
 
 STATES = 200
 DISK_BYTES = 48 << 20

@@ -28,10 +28,10 @@ from thermostand.recording.reading.notes import read_notes
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.serve import serve as serve_stand
 from thermostand.stand.running.guest import Guest
-from thermostand.stand.service import DeviceRequest, StandService, SubmitRequest
+from thermostand.stand.service.daemon import Daemon
+from thermostand.stand.service.serve import serve as serve_stand
+from thermostand.stand.service.stand_service import DeviceRequest, StandService, SubmitRequest
 from thermostand.stand.serving.client import Server, server_of
 from thermostand.stand.serving.desk import Conflict, StandState, Who
 

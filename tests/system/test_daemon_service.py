@@ -17,9 +17,9 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.serve import serve as serve_stand
-from thermostand.stand.service import StandService
+from thermostand.stand.service.daemon import Daemon
+from thermostand.stand.service.serve import serve as serve_stand
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve as serve_clients
 from thermostand.stand.serving.client import server_of

@@ -24,10 +24,10 @@ from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.memory.entries import Tripped
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 
 @pytest.fixture(autouse=True)

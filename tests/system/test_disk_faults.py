@@ -37,15 +37,15 @@ from thermostand.stand.chamber.compressor import CompressorState, keep, restored
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.daemon.daemon_file import Kept, kept_in
 from thermostand.stand.estimating.learned import Learned, load_learned
 from thermostand.stand.fault import Fault
-from thermostand.stand.queueing import queue
 from thermostand.stand.running.memory.entries import Dwell, Ended, Held, Step, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
 from thermostand.stand.running.opening.claim import latch_file
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.resume import begun, interruption
+from thermostand.stand.service import queue
+from thermostand.stand.service.daemon_file import KeptCounters, kept_in
 
 START_NS = 1_767_290_400 * NS_PER_S
 TRIPPED, KILLED = "20260101T180000Z-tripped", "20260102T180000Z-killed"
@@ -157,7 +157,7 @@ class Stand:
             queue.take(self.sessions, START_NS + number)
         keep(self.sessions / "compressor.json", compressor(number), BOOT)
         counters = {f"relay_cycles.{n}": float(7**number + n) for n in range(20)}
-        self.write(self.sessions / "daemon.json", "counters", Kept(counters=counters))
+        self.write(self.sessions / "daemon.json", "counters", KeptCounters(counters=counters))
         learned = Learned(overheads_s={f"soak {n}": float(5**number + n) for n in range(20)}, nights=(str(number),))
         self.write(self.sessions / "learned.json", "learned", learned)
         write_tokens(self.tokens, tokens(number))

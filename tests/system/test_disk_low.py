@@ -13,8 +13,8 @@ from thermostand.experiments.steps import Capture
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Frame
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 RECIPE = """
 name: disk

@@ -15,8 +15,8 @@ from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, Quality
 from thermostand.recording.exporting.export import frames_rows
 from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 OFFSET_K = 10.0
 RECIPE = """

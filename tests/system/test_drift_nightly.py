@@ -25,8 +25,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.progress import progress
 from thermostand.foundation.readings import Frame
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 

@@ -17,9 +17,9 @@ from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.estimating.estimate import price
 from thermostand.stand.estimating.eta import Eta
 from thermostand.stand.estimating.learned import learn, load_learned
-from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 

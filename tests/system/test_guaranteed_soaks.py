@@ -17,9 +17,9 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.readings import UNSETTLED
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 RECIPE = """
 name: soaked

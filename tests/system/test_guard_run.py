@@ -22,11 +22,11 @@ from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import Interrupted, run_virtual
 from thermostand.stand.running.memory.entries import Cleared, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import Interrupted, run_virtual
 
 POLLED = AS_INSTALLED
 

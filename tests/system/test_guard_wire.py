@@ -25,8 +25,8 @@ from thermostand.stand.chamber.compressor import CompressorState, keep
 from thermostand.stand.config.stand_config import CompressorConfig, StandConfig, packaged
 from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.rules import Announcements, watches
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 from thermostand.stand.simulator import ControlSocket, Simulator
 
 POLLED = AS_INSTALLED

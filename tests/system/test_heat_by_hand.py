@@ -16,10 +16,10 @@ from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import bad_reading
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.day_record import DayRecord
-from thermostand.stand.daemon.serve import serve as serve_stand
-from thermostand.stand.service import DeviceRequest, StandService
+from thermostand.stand.service.daemon import Daemon
+from thermostand.stand.service.day_record import DayRecord
+from thermostand.stand.service.serve import serve as serve_stand
+from thermostand.stand.service.stand_service import DeviceRequest, StandService
 from thermostand.stand.serving.desk import Who
 
 

@@ -26,8 +26,8 @@ from thermostand.foundation.items import Item, StepMark
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.sessions.session_commands import app
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.run import run_real
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_real
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 MOVED = Path(__file__).parent / "moved_clocks"

@@ -40,7 +40,7 @@ def test_a_package_loads_no_heavy_library(module: str):
 @pytest.mark.parametrize(("recipe", "heavy"), [("demo", set[str]()), ("thermal-cycle-settled", {"numba", "scipy"})])
 def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(recipe: str, heavy: set[str]):
     code = (
-        "import thermostand.stand.run\n"
+        "import thermostand.stand.service.run\n"
         "from thermostand.stand.running.order import load_order\n"
         "from thermostand.stand.running.executing.settling_watch import load_for\n"
         f"load_for(load_order({recipe!r}, 'simulated').recipe.plan())"

@@ -14,8 +14,8 @@ from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.guarding.rules import Announcements, watches
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import load_order
+from thermostand.stand.service.run import run_virtual
 
 STEPS = """
 name: rest

@@ -12,11 +12,11 @@ from thermostand.experiments.known import Visit
 from thermostand.experiments.steps import Capture, Decide
 from thermostand.foundation.clock import WallClock
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.executing.deciding import Decider
 from thermostand.stand.running.memory.entries import Edited
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.session_report import DECIDES
+from thermostand.stand.service.run import run_virtual
 
 pytestmark = pytest.mark.nightly
 

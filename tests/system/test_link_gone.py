@@ -24,11 +24,11 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.daemon.daemon import Daemon
-from thermostand.stand.daemon.serve import serve
-from thermostand.stand.run import Interrupted, run_virtual
 from thermostand.stand.running.order import Order
-from thermostand.stand.service import StandService, SubmitRequest
+from thermostand.stand.service.daemon import Daemon
+from thermostand.stand.service.run import Interrupted, run_virtual
+from thermostand.stand.service.serve import serve
+from thermostand.stand.service.stand_service import StandService, SubmitRequest
 from thermostand.stand.serving.desk import Who
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
@@ -137,7 +137,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
     ordered = order(SOAK, **FAST | {"bus": QUICK})
     await asyncio.to_thread(simulator, ordered.config, False)
     monkeypatch.setattr("thermostand.stand.safety._GIVEN_UP_AFTER_S", 0.1)
-    monkeypatch.setattr("thermostand.stand.daemon.daemon._LOOK_S", 0.2)
+    monkeypatch.setattr("thermostand.stand.service.daemon._LOOK_S", 0.2)
     text = (tmp_path / "config.yaml").read_text()
     texts = {"config.yaml": text, "target.yaml": packaged("targets", ordered.config.target).read_text()}
     watcher = Watcher()

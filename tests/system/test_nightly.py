@@ -13,8 +13,8 @@ from thermostand.compensation.drift.evaluation import Evaluation
 from thermostand.compensation.reporting.report import analyse
 from thermostand.foundation.progress import progress
 from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 

@@ -19,10 +19,10 @@ from thermostand.foundation.errors import SessionError, StandError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import Interrupted, run_virtual
 from thermostand.stand.running.memory.entries import Held
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import Interrupted, run_virtual
 
 pytestmark = pytest.mark.usefixtures("_aravis")
 

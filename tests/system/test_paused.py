@@ -17,7 +17,7 @@ from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import Order
-from thermostand.stand.service import PauseRequest, StandService
+from thermostand.stand.service.stand_service import PauseRequest, StandService
 from thermostand.stand.serving.desk import Done, Who
 
 

@@ -17,10 +17,10 @@ from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.executing.executor import Executor
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
 

@@ -11,8 +11,8 @@ from tests.system.conftest import AS_INSTALLED, CORNER, WHOLE_SENSOR, require_ar
 from tests.system.test_guard_wire import Bench, bench_of
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 from thermostand.stand.simulator import Simulator
 
 POLLED = AS_INSTALLED

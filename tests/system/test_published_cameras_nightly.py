@@ -15,8 +15,8 @@ from thermostand.experiments.steps import Role
 from thermostand.foundation.documents import parse_document
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 from .conftest import require_aravis
 

@@ -19,14 +19,14 @@ from thermostand.foundation.errors import SessionError, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark
 from thermostand.recording.reading.session import Session
+from thermostand.stand.commands.live import RunFollower
+from thermostand.stand.commands.moment import ShownMoment
 from thermostand.stand.config.interface_section import InterfaceConfig
-from thermostand.stand.run import Interrupted, run_real
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import Interrupted, run_real
 from thermostand.stand.serving.client import API, server_at
 from thermostand.stand.serving.front import interface_of
 from thermostand.stand.simulator import ControlSocket
-from thermostand.stand.watching.live import Following
-from thermostand.stand.watching.moment import Moment
 
 BRIEF = """
 name: brief
@@ -106,8 +106,8 @@ async def test_a_run_by_itself_has_the_page_and_secop_of_its_file_and_either_sto
     await asyncio.to_thread(simulator, ordered.config, False)
     ports = InterfaceConfig(port=free_port(), secop_port=free_port())
     config = ordered.config.model_copy(update={"interface": ports})
-    lines, moments, out = list[str](), list[Moment](), tmp_path / "out"
-    shown = Following(moments.append, lines.append, out)
+    lines, moments, out = list[str](), list[ShownMoment](), tmp_path / "out"
+    shown = RunFollower(moments.append, lines.append, out)
     front = shown.front_at(interface_of(config, out), ordered.target_text)
     run = asyncio.create_task(run_real(ordered, out, shown.watch, front=front))
     there = server_at(f"http://127.0.0.1:{ports.port}")

@@ -12,8 +12,8 @@ from thermostand.compensation.observations import observe_session, session_targe
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 RECIPE = """
 name: short

@@ -9,8 +9,8 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.recording.reading.run_word import RunOutcome
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.run import rehearsed, run_virtual
 from thermostand.stand.running.order import load_order
+from thermostand.stand.service.run import rehearsed, run_virtual
 
 RECIPE = "name: short\nsteps:\n  - start_chamber: 26\n  - soak: 300\n  - stop_chamber\n"
 

@@ -25,11 +25,11 @@ from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.memory.entries import Dwell, Gap, Step
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import Interruption, interruption
+from thermostand.stand.service.run import Interrupted, resume, run_virtual
 from thermostand.stand.simulator import ControlSocket
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")

@@ -22,11 +22,11 @@ from thermostand.foundation.sealed import seal
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.queueing.queue_file import QUEUE_NAME
-from thermostand.stand.run import Interrupted, resume, run_real, run_virtual
 from thermostand.stand.running.opening.own_stand import on_this_stand
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.queue_file import QUEUE_NAME
+from thermostand.stand.service.run import Interrupted, resume, run_real, run_virtual
 
 CAPTURES = """
 name: captures

@@ -23,8 +23,8 @@ from thermostand.foundation.errors import ConfigError, SessionError, StandError,
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import Interrupted, run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import Interrupted, run_virtual
 from thermostand.stand.simulator import ControlSocket
 
 pytestmark = pytest.mark.usefixtures("_aravis")
@@ -147,7 +147,7 @@ DAEMON = """
 import asyncio, pickle, sys
 from pathlib import Path
 from thermostand.foundation.items import Batch
-from thermostand.stand.run import run_virtual
+from thermostand.stand.service.run import run_virtual
 
 order, out = pickle.loads(sys.stdin.buffer.read())
 

@@ -26,8 +26,8 @@ from thermostand.foundation.errors import NotCleared, StandTripped
 from thermostand.foundation.items import Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.run import Interrupted, run_real, run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import Interrupted, run_real, run_virtual
 from thermostand.stand.simulator import Simulator
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")

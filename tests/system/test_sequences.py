@@ -11,8 +11,8 @@ from thermostand.experiments.steps import Role
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.progress import progress
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 RECIPE = """
 name: sequences

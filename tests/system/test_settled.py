@@ -13,9 +13,9 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import StepState
 from thermostand.foundation.progress import progress
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.memory.entries import Dwell
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 RECIPE = """
 name: settled

@@ -29,8 +29,8 @@ from thermostand.foundation.items import Item
 from thermostand.foundation.progress import progress
 from thermostand.foundation.readings import Frame
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 

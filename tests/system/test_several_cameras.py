@@ -17,10 +17,10 @@ from thermostand.recording.reading.scan import Files, verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.run import resume, run_virtual
 from thermostand.stand.running.opening.stop import Interrupted
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import resume, run_virtual
 
 from .conftest import CALM, require_aravis
 from .test_run import at_step

@@ -17,7 +17,7 @@ from tests.system.virtual_stand import VirtualStand, bare_config, virtual_stand
 from thermostand.drivers.devices.regulators.pid import Law
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
 from thermostand.foundation.errors import DeviceFault, Occupied, Refused
-from thermostand.stand.queueing.by_hand import ByHand
+from thermostand.stand.service.by_hand import ByHand
 from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
 LIMIT_S = 60.0  # real, for what takes a few seconds on a machine that has other things to do

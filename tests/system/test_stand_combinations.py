@@ -24,10 +24,10 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.daemon.hands_on import known_devices
 from thermostand.stand.estimating.absent import absences
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order, check_plan
+from thermostand.stand.service.hands_on import known_devices
+from thermostand.stand.service.run import run_virtual
 from thermostand.stand.simulator import laboratory_of
 
 Data = dict[str, Any]

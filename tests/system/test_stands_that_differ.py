@@ -14,8 +14,8 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.estimating.absent import absences
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order, check_plan
+from thermostand.stand.service.run import run_virtual
 
 RECIPE = """
 name: short

@@ -19,8 +19,8 @@ from thermostand.foundation.tasks import cancelled
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.gate import INTERLOCK
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 RECIPE = """
 name: two-places

@@ -13,8 +13,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
 from thermostand.recording.reading.session import Session
-from thermostand.stand.run import Interrupted, run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import Interrupted, run_virtual
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
 SEVERAL = SHORTER.replace("reference_frames: 2", "reference_frames: 5")

@@ -21,9 +21,9 @@ from thermostand.foundation.items import Batch, Event, Item, StepState
 from thermostand.recording.reading.run_word import RunOutcome
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.run import Interrupted, resume, run_virtual
 from thermostand.stand.running.order import Order, load_order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 RECIPE = "name: away\nsteps:\n  - start_chamber: {set_point}\n  - soak: {soak_s}\n  - stop_chamber\n"
 

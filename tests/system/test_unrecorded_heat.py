@@ -22,10 +22,10 @@ from thermostand.foundation.errors import StandError, StandTripped
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
 from thermostand.recording.writing.disk import MODULE
-from thermostand.stand.run import run_real
 from thermostand.stand.running.opening.writer_restarts import MOST_PER_H
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import run_real
 from thermostand.stand.simulator import ControlSocket
 
 SOAK = """

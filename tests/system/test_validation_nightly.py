@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from tests.system.conftest import require_aravis
 from thermostand.compensation import cli
-from thermostand.stand.run import run_virtual
 from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
 
 pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
 

@@ -11,8 +11,8 @@ from tests.torture.real import KINDS as REAL
 from tests.torture.rig import Result
 from thermostand.drivers.sim.laboratory_faults import FAULTS
 from thermostand.foundation.events import GUARD
+from thermostand.stand.commands.remedies import rows
 from thermostand.stand.running.memory.entries import Written
-from thermostand.stand.watching.remedies import rows
 
 SITUATIONS = ("between", "soak", "capture", "step", "held", "tripped", "ended")
 """Of a run, as its journal shows them: what is under way, or why nothing is."""

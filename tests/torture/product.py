@@ -20,7 +20,7 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 
-import thermostand.stand.run as run_module
+import thermostand.stand.service.run as run_module
 from tests.torture.case import Case, Order, read_case
 from tests.torture.doors import Doors
 from tests.torture.laboratory import FOLDER, LIFE

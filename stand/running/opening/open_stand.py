@@ -46,7 +46,7 @@ class RunRecorder(Recording, Protocol):
         ...
 
 
-class Guest(Protocol):
+class RunGuest(Protocol):
     """The run that has the stand."""
 
     @property
@@ -79,7 +79,7 @@ class OpenStand:
         self.is_for_one = is_for_one
         self.background: list[asyncio.Task[None]] = []
         self.recorder: RunRecorder | None = None
-        self.guest: Guest | None = None
+        self.guest: RunGuest | None = None
         self._announced = Announcements()
         self._guard: Guard | None = None
         self._pollers: tuple[Poller, ...] = ()

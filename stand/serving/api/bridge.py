@@ -47,7 +47,7 @@ class NoAnswer(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class StateSnapshot:
     """The stand as it was at `at_s` (time.monotonic)."""
 
     state: StandState
@@ -85,7 +85,7 @@ class Bridge:
         self._refreshing: asyncio.Future[None] | None = None
         self._next: asyncio.TimerHandle | None = None
         self._is_open = True
-        self.snapshot = Snapshot(service.state(), time.monotonic())
+        self.snapshot = StateSnapshot(service.state(), time.monotonic())
         self._refresh()
         self._hub.subscribe(self._follow)
 
@@ -120,7 +120,7 @@ class Bridge:
             return
         try:
             state = self._service.state().model_copy(update={"seq": self._seq})
-            self.snapshot, self.failure = Snapshot(state, time.monotonic()), ""
+            self.snapshot, self.failure = StateSnapshot(state, time.monotonic()), ""
         except Exception as error:  # noqa: BLE001 - clients see that it is old; the run does not depend on them
             self.failure = failure_text(error)
         self._next = None
@@ -179,7 +179,7 @@ class Bridge:
         stopping.add_done_callback(lambda each: each.cancelled() or each.exception())  # others have it, too
         return await _within(COMMAND_LIMIT_S, asyncio.shield(stopping))
 
-    async def fresh(self) -> Snapshot:
+    async def fresh(self) -> StateSnapshot:
         """The stand as it is now; the last snapshot when the control loop has no time for another one."""
         if self._refreshing is None:
             self._refreshing = asyncio.ensure_future(self.ask(lambda _: self._refresh(), _FRESH_S))

@@ -14,7 +14,7 @@ from starlette.websockets import WebSocketDisconnect
 from thermostand.experiments.steps import schema_of_steps
 from thermostand.foundation.documents import Document
 from thermostand.stand.serving.api.access import COOKIE, INVITE_PATH, LOGIN_PATH, Access
-from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, Snapshot
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, StateSnapshot
 from thermostand.stand.serving.api.stream import EVENTS, MOST_VIEWERS, Stream, json_of
 from thermostand.stand.serving.desk import PlanStep, StandState, Who
 
@@ -25,7 +25,7 @@ _PHASES = ("idle", "running", "held", "stopping")
 _Sample = tuple[Mapping[str, str], float]
 
 
-def metrics(snapshot: Snapshot, drops: int, viewers: int) -> str:
+def metrics(snapshot: StateSnapshot, drops: int, viewers: int) -> str:
     """The whole page."""
     state = snapshot.state
     lines: list[str] = []
@@ -86,7 +86,7 @@ def _of_run(state: StandState) -> Iterator[_Metric]:
         yield "left_seconds", "gauge", "Expected until the run ends.", [({}, (run.end_ns - run.now_ns) / 1e9)]
 
 
-def _of_interface(snapshot: Snapshot, drops: int, viewers: int) -> Iterator[_Metric]:
+def _of_interface(snapshot: StateSnapshot, drops: int, viewers: int) -> Iterator[_Metric]:
     yield "snapshot_age_seconds", "gauge", "Since the control loop last said how it is.", [({}, snapshot.age_s)]
     yield "interface_drops_total", "counter", "Items that the interface was too slow for.", [({}, float(drops))]
     yield "viewers", "gauge", "Clients that follow the stream.", [({}, float(viewers))]

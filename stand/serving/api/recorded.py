@@ -59,7 +59,7 @@ class SessionEntry(BaseModel):
     copies: list[str]
 
 
-class Disk:
+class RecordedDisk:
     """One question to the disk at a time, each in a thread that does not keep the process from ending: asyncio's own
     threads would."""
 
@@ -100,7 +100,7 @@ def session_in(folder: Path, name: str) -> Path:
 
 def recorded(_: Bridge, folder: Path) -> APIRouter:
     """The routes."""
-    router, disk, memory = APIRouter(prefix="/api/v1"), Disk(), Memory()
+    router, disk, memory = APIRouter(prefix="/api/v1"), RecordedDisk(), Memory()
 
     @router.get("/recipes", response_model=list[RecipeEntry])
     async def recipes() -> list[RecipeEntry]:

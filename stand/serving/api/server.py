@@ -26,7 +26,7 @@ from thermostand.stand.serving.api.bridge import Bridge
 from thermostand.stand.serving.api.doors import Interface, OtherDoor
 from thermostand.stand.serving.api.stop_thread import Door, StopThread
 from thermostand.stand.serving.commands import Served
-from thermostand.stand.serving.presence import Entry, Presence
+from thermostand.stand.serving.presence import DaemonEntry, Presence
 
 _UNIX: tuple[Door, ...] = ("socket", "stop")
 _TCP: Door = "tcp"
@@ -47,7 +47,7 @@ async def serve(
     """
     hub, clock = service.hub, service.clock
     interface.check()
-    presence = Presence(Entry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
+    presence = Presence(DaemonEntry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
     report, patience = _reporter(hub, clock), patience or Patience()
     everything, stopping = presence.appear()
     doors = {"socket": everything, "stop": stopping}

@@ -19,7 +19,7 @@ from pydantic_core import to_json
 
 from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
 from thermostand.foundation.readings import Frame, Quality, Reading
-from thermostand.stand.serving.api.bridge import Bridge, Snapshot
+from thermostand.stand.serving.api.bridge import Bridge, StateSnapshot
 from thermostand.stand.serving.desk import StandState
 
 EVENTS = 5_000  # kept for those who reconnect: days
@@ -33,7 +33,7 @@ Kind = Literal["state", "event", "reading", "gone"]
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class StreamMessage:
     """A numbered item of the stream; data: JSON of an object. Written once for all viewers, and as a text: thousands
     are kept, and each value in them would be looked at whenever Python searches this process for garbage."""
 
@@ -59,21 +59,21 @@ def _plain(value: object) -> object:
     return dict(value) if isinstance(value, Mapping) else str(value)  # pyright: ignore[reportUnknownVariableType]
 
 
-def message_of(seq: int, utc_offset_ns: int, item: Item) -> Message:
+def message_of(seq: int, utc_offset_ns: int, item: Item) -> StreamMessage:
     """An item as the stream gives it: a step of the plan that began or ended is an event of kind `step`."""
     stamp = {"time_ns": item.time_ns, "utc_offset_ns": utc_offset_ns}
     match item:
         case Event(_, level, kind, text, data):
             fields = {**stamp, "level": level, "kind": kind, "text": text, "data": dict(data)}
-            return Message(seq, "event", json_of(fields))
+            return StreamMessage(seq, "event", json_of(fields))
         case StepMark(_, step_id, index, kind, state, parameters):
             data = {"step_id": step_id, "index": index, "step": kind, "state": state, "parameters": parameters}
             text = f"step {index + 1} ({kind}) {state}"
             fields = {**stamp, "level": "info", "kind": "step", "text": text, "data": data}
-            return Message(seq, "event", json_of(fields))
+            return StreamMessage(seq, "event", json_of(fields))
         case Batch(device, _, readings):
             values = {reading.channel: reading_of(reading) for reading in readings}
-            return Message(seq, "reading", json_of({**stamp, "device": device, "readings": values}))
+            return StreamMessage(seq, "reading", json_of({**stamp, "device": device, "readings": values}))
         case Frame() | Original():
             raise ValueError("images are no items of the stream")
 
@@ -94,7 +94,7 @@ def reading_of(reading: Reading) -> dict[str, object]:
 class Viewer:
     """One client: what it has not been sent yet, a replay to begin with. Of states only the last one counts."""
 
-    def __init__(self, replay: Iterable[Message] = ()) -> None:
+    def __init__(self, replay: Iterable[StreamMessage] = ()) -> None:
         self.drops = 0
         self._waiting = deque(replay)
         self._most = _QUEUE + len(self._waiting)
@@ -103,7 +103,7 @@ class Viewer:
         self._since_state = 0
         self._something = asyncio.Event()
 
-    def give(self, message: Message) -> None:
+    def give(self, message: StreamMessage) -> None:
         """Queue a message, instead of the oldest one when there are too many."""
         if len(self._waiting) >= self._most:
             oldest = self._waiting.popleft()
@@ -129,7 +129,7 @@ class Viewer:
         self._since_state += 1
         if self._lost is not None:
             (first, last), self._lost = self._lost, None
-            return Message(last, "gone", json_of({"first": first, "last": last, "drops": self.drops})).json()
+            return StreamMessage(last, "gone", json_of({"first": first, "last": last, "drops": self.drops})).json()
         return self._waiting.popleft().json()
 
 
@@ -139,12 +139,12 @@ class Stream:
     def __init__(self, bridge: Bridge) -> None:
         self.drops = 0  # items that were dropped before this thread took them
         self._bridge = bridge
-        self._events: deque[Message] = deque(maxlen=EVENTS)
-        self._readings: deque[Message] = deque(maxlen=READINGS)
+        self._events: deque[StreamMessage] = deque(maxlen=EVENTS)
+        self._readings: deque[StreamMessage] = deque(maxlen=READINGS)
         self._first = self._seq = bridge.snapshot.state.seq
         self._gone_events = self._gone_readings = self._seq  # the last numbers that are in no ring any more
         self._viewers: set[Viewer] = set()
-        self._reported: Snapshot | None = None
+        self._reported: StateSnapshot | None = None
 
     @property
     def viewers(self) -> int:
@@ -185,12 +185,12 @@ class Stream:
         """It is not there any more."""
         self._viewers.discard(viewer)
 
-    def events(self, after: int, limit: int) -> list[Message]:
+    def events(self, after: int, limit: int) -> list[StreamMessage]:
         """The events after a number, at most so many."""
         self.pump()
         return list(islice((each for each in self._events if each.seq > after), limit))
 
-    def missing(self, after: int) -> Message | None:
+    def missing(self, after: int) -> StreamMessage | None:
         """What a viewer that has seen all up to `after` cannot be given any more."""
         first, last = after + 1, max(self._gone_events, self._gone_readings)
         if after > self._seq:  # of another stream
@@ -198,7 +198,7 @@ class Stream:
         elif last < first:
             return None
         gone = {"first": first, "last": last, "types": self.missing_types(after), "drops": self.drops}
-        return Message(last, "gone", json_of(gone))
+        return StreamMessage(last, "gone", json_of(gone))
 
     def missing_types(self, after: int) -> list[Kind]:
         """Of which types some are gone for a viewer that has seen all up to `after`."""
@@ -206,13 +206,13 @@ class Stream:
         gone: tuple[tuple[Kind, int], ...] = (("event", self._gone_events), ("reading", self._gone_readings))
         return [kind for kind, last in gone if last > after or is_other]
 
-    def after(self, after: int) -> Iterator[Message]:
+    def after(self, after: int) -> Iterator[StreamMessage]:
         """What is kept of both rings, in order; all of it for a number of another stream."""
         after = after if after <= self._seq else self._first
         kept = sorted((*self._events, *self._readings), key=lambda message: message.seq)
         return (message for message in kept if message.seq > after)
 
-    def _keep(self, message: Message) -> None:
+    def _keep(self, message: StreamMessage) -> None:
         if message.type == "event":
             if len(self._events) == EVENTS:
                 self._gone_events = self._events[0].seq
@@ -223,7 +223,7 @@ class Stream:
             self._readings.append(message)
 
 
-def state_json(snapshot: Snapshot, drops: int) -> str:
+def state_json(snapshot: StateSnapshot, drops: int) -> str:
     """The message of a state."""
     state: StandState = snapshot.state.model_copy(update={"drops": drops})
     return f'{{"seq":{state.seq},"type":"state","data":{state.model_dump_json()}}}'

@@ -8,7 +8,7 @@ from pydantic import JsonValue
 
 from thermostand.stand.estimating.chamber_model import BAND_K
 from thermostand.stand.serving.commands import STOP
-from thermostand.stand.serving.commands import Command as Ordered
+from thermostand.stand.serving.commands import ModuleCommand as Ordered
 from thermostand.stand.serving.desk import DeviceState, ReadingState, RunStatus, StandState
 from thermostand.stand.serving.secop import datainfo
 from thermostand.stand.serving.secop.modules import (
@@ -19,12 +19,12 @@ from thermostand.stand.serving.secop.modules import (
     RAMPING,
     SENSOR_CODES,
     WARN,
-    Command,
-    Known,
+    KnownValue,
     Module,
-    Order,
+    ModuleCommand,
+    ModuleView,
     Parameter,
-    Seen,
+    ServiceOrder,
     by_hand,
     driven,
     measured,
@@ -92,7 +92,7 @@ def _chamber(device: DeviceState) -> Module:
         reading = state.readings.get(sp)
         return -1 if reading is None else reading.time_ns
 
-    def read_status(seen: Seen) -> tuple[int, str]:
+    def read_status(seen: ModuleView) -> tuple[int, str]:
         code, sentence = driven(seen, pv, read_ns(seen.state))
         target = seen.state.setpoint_degC
         if code not in (IDLE, WARN):
@@ -103,10 +103,10 @@ def _chamber(device: DeviceState) -> Module:
             return RAMPING, f"on the way to {target:g} degC"
         return code, sentence or f"at {target:g} degC"
 
-    def read_target(seen: Seen) -> Known:
-        return seen.number(sp) if seen.drive.ordered is None else Known(seen.drive.ordered)
+    def read_target(seen: ModuleView) -> KnownValue:
+        return seen.number(sp) if seen.drive.ordered is None else KnownValue(seen.drive.ordered)
 
-    def change(value: JsonValue) -> Order:
+    def change(value: JsonValue) -> ServiceOrder:
         return by_hand(name, "set", setpoint_degC=value)
 
     parameters = {
@@ -114,52 +114,56 @@ def _chamber(device: DeviceState) -> Module:
         "status": status(DRIVE_CODES, read_status),
         "target": Parameter("the set-point", datainfo.double("degC", low, high), read_target, change),
         "control_active": Parameter(
-            "whether it heats or cools", datainfo.boolean(), lambda s: Known(s.state.setpoint_degC is not None)
+            "whether it heats or cools", datainfo.boolean(), lambda s: KnownValue(s.state.setpoint_degC is not None)
         ),
-        "_tolerance": Parameter("so close to the target it is IDLE", datainfo.double("K"), lambda _: Known(BAND_K, 0)),
+        "_tolerance": Parameter(
+            "so close to the target it is IDLE", datainfo.double("K"), lambda _: KnownValue(BAND_K, 0)
+        ),
         "_output": Parameter("heat; below zero cold", datainfo.double("%"), _output),
         "_heat_permitted": Parameter(
-            "whether heat is permitted", datainfo.boolean(), lambda s: Known(s.state.heater_permitted)
+            "whether heat is permitted", datainfo.boolean(), lambda s: KnownValue(s.state.heater_permitted)
         ),
         "_compressor_on": Parameter(
-            "whether the compressor's relay is on", datainfo.boolean(), lambda s: Known(s.state.compressor_on)
+            "whether the compressor's relay is on", datainfo.boolean(), lambda s: KnownValue(s.state.compressor_on)
         ),
     }
-    stop = Command("stop heating and cooling; the air drifts to the laboratory's", lambda _: by_hand(name, "stop"))
+    stop = ModuleCommand(
+        "stop heating and cooling; the air drifts to the laboratory's", lambda _: by_hand(name, "stop")
+    )
     return Module("the chamber's temperature", "Drivable", CHAMBER, parameters, {"stop": stop}, name, read_ns)
 
 
-def _output(seen: Seen) -> Known:
+def _output(seen: ModuleView) -> KnownValue:
     if seen.state.output_percent is None:
         raise Refusal("ReadFailed", "the regulator's output is not known")
-    return Known(seen.state.output_percent)
+    return KnownValue(seen.state.output_percent)
 
 
 def _flap(device: DeviceState) -> Module:
     name, channel = device.name, f"{device.name}.position"
     places = {"closed": _CLOSED, "open": _OPEN}
 
-    def read(seen: Seen) -> int:
+    def read(seen: ModuleView) -> int:
         return {**places, "moving": _MOVING}.get(seen.state.flap, _MOVING)
 
-    def read_status(seen: Seen) -> tuple[int, str]:
+    def read_status(seen: ModuleView) -> tuple[int, str]:
         return (BUSY, "under way") if read(seen) == _MOVING else driven(seen, channel, seen.state.now_ns)
 
-    def read_target(seen: Seen) -> Known:
+    def read_target(seen: ModuleView) -> KnownValue:
         ordered = seen.drive.ordered
-        return Known(ordered if ordered is not None else min(read(seen), _OPEN))
+        return KnownValue(ordered if ordered is not None else min(read(seen), _OPEN))
 
-    def change(value: JsonValue) -> Order:
+    def change(value: JsonValue) -> ServiceOrder:
         return by_hand(name, "open" if value == _OPEN else "close")
 
     parameters = {
         "value": Parameter(
-            "where it is", datainfo.choice({**places, "moving": _MOVING}), lambda seen: Known(read(seen))
+            "where it is", datainfo.choice({**places, "moving": _MOVING}), lambda seen: KnownValue(read(seen))
         ),
         "status": status(DRIVE_CODES, read_status),
         "target": Parameter("where it is to be", datainfo.choice(places), read_target, change),
     }
-    stop = Command("nothing: a flap is not left half open, its move of seconds is completed", None)
+    stop = ModuleCommand("nothing: a flap is not left half open, its move of seconds is completed", None)
     return Module("the flap between chamber and camera", "Drivable", name, parameters, {"stop": stop}, name)
 
 
@@ -172,13 +176,13 @@ def _axis(device: DeviceState, readings: Mapping[str, ReadingState]) -> Module:
         reading = state.readings.get(channel)
         return -1 if reading is None else reading.time_ns
 
-    def read_status(seen: Seen) -> tuple[int, str]:
+    def read_status(seen: ModuleView) -> tuple[int, str]:
         return driven(seen, channel, read_ns(seen.state))
 
-    def read_target(seen: Seen) -> Known:
-        return seen.number(channel) if seen.drive.ordered is None else Known(seen.drive.ordered)
+    def read_target(seen: ModuleView) -> KnownValue:
+        return seen.number(channel) if seen.drive.ordered is None else KnownValue(seen.drive.ordered)
 
-    def change(value: JsonValue) -> Order:
+    def change(value: JsonValue) -> ServiceOrder:
         return by_hand(name, "move", position=value)
 
     parameters = {
@@ -187,18 +191,20 @@ def _axis(device: DeviceState, readings: Mapping[str, ReadingState]) -> Module:
         "target": Parameter("where it is to be", {**info, **_limits(device, "move")}, read_target, change),
     }
     commands = {
-        "stop": Command("stop where it is", lambda _: by_hand(name, "stop")),
-        "_home": Command("find the home switch", lambda _: by_hand(name, "home")),
+        "stop": ModuleCommand("stop where it is", lambda _: by_hand(name, "stop")),
+        "_home": ModuleCommand("find the home switch", lambda _: by_hand(name, "home")),
     }
     return Module(f"the stage {name}", "Drivable", "stages", parameters, commands, name, read_ns, is_read_after=True)
 
 
 def _run(commands: Mapping[str, Ordered]) -> Module:
     def parameter(text: str, info: datainfo.DataInfo, read: Callable[[RunStatus], JsonValue], none: JsonValue):
-        return Parameter(text, info, lambda s: Known(none if s.state.run is None else read(s.state.run)))
+        return Parameter(text, info, lambda s: KnownValue(none if s.state.run is None else read(s.state.run)))
 
     parameters = {
-        "value": Parameter("the phase of the stand", datainfo.choice(_PHASES), lambda s: Known(_PHASES[s.state.phase])),
+        "value": Parameter(
+            "the phase of the stand", datainfo.choice(_PHASES), lambda s: KnownValue(_PHASES[s.state.phase])
+        ),
         "status": status(DRIVE_CODES, _run_status),
         "_recipe": parameter("what is run", datainfo.text(), lambda run: run.recipe, ""),
         "_session": parameter("the name of its session", datainfo.text(), lambda run: run.run_id, ""),
@@ -210,18 +216,20 @@ def _run(commands: Mapping[str, Ordered]) -> Module:
         "_prompt": Parameter(
             "what an operator is asked for",
             datainfo.text(),
-            lambda s: Known(s.state.prompt.text if s.state.prompt else ""),
+            lambda s: KnownValue(s.state.prompt.text if s.state.prompt else ""),
         ),
-        "_held_by": Parameter("what holds it", datainfo.text(), lambda s: Known(", ".join(s.state.reasons))),
+        "_held_by": Parameter("what holds it", datainfo.text(), lambda s: KnownValue(", ".join(s.state.reasons))),
         "_fault": Parameter(
-            "what has tripped", datainfo.text(), lambda s: Known("" if s.state.fault is None else s.state.fault.text)
+            "what has tripped",
+            datainfo.text(),
+            lambda s: KnownValue("" if s.state.fault is None else s.state.fault.text),
         ),
     }
     ordered = {_NAMES.get(name, f"_{name}"): _command(each) for name, each in commands.items() if _is_offered(each)}
     return Module("runs, and the stand as a whole", "Readable", RUN, parameters, ordered)
 
 
-def _run_status(seen: Seen) -> tuple[int, str]:
+def _run_status(seen: ModuleView) -> tuple[int, str]:
     state = seen.state
     if state.fault is not None:
         return ERROR, state.fault.text
@@ -242,16 +250,16 @@ def _type_of(command: Ordered, field: str) -> object:
     return None if command.argument is None else command.argument.model_fields[field].annotation
 
 
-def _command(command: Ordered) -> Command:
+def _command(command: Ordered) -> ModuleCommand:
     """A command of the stand's service, with at most one field of its argument; what it queues has a number."""
     field = command.secop_field
 
-    def order(value: JsonValue) -> Order:
-        return Order(command.name, {field: value} if field else {})
+    def order(value: JsonValue) -> ServiceOrder:
+        return ServiceOrder(command.name, {field: value} if field else {})
 
     argument = _INFOS[_type_of(command, field)]() if field else None
     result = datainfo.whole() if "id" in command.answer.model_fields else None
-    return Command(command.summary, order, argument, result, is_stop=command.name == STOP)
+    return ModuleCommand(command.summary, order, argument, result, is_stop=command.name == STOP)
 
 
 def _range(device: DeviceState, verb: str) -> tuple[float | None, float | None]:

@@ -21,7 +21,7 @@ from thermostand.stand.serving.secop.secop_lines import (
     IDENTIFY,
     LINE_LIMIT_BYTES,
     Refusal,
-    Request,
+    SecopRequest,
     message,
     parsed,
     refused,
@@ -147,8 +147,8 @@ class _Client:
         self._loop = asyncio.get_running_loop()
         self._heard_s = self._loop.time()
         self._followed: set[str] = set()  # modules
-        self._asked: asyncio.Queue[Request] = asyncio.Queue(_MOST_WAITING)
-        self._stops: deque[Request] = deque(maxlen=_MOST_WAITING)
+        self._asked: asyncio.Queue[SecopRequest] = asyncio.Queue(_MOST_WAITING)
+        self._stops: deque[SecopRequest] = deque(maxlen=_MOST_WAITING)
         self._stopping: asyncio.Task[None] | None = None
         self._outgoing: dict[Place | int, bytes] = {}
         self._answers = 0  # ever given, and how many of them wait
@@ -209,7 +209,7 @@ class _Client:
                 await asyncio.sleep(_REST_S)
 
     def _too_long(self) -> None:
-        self._refuse(Request("line"), Refusal("ProtocolError", f"a line has at most {LINE_LIMIT_BYTES} bytes"))
+        self._refuse(SecopRequest("line"), Refusal("ProtocolError", f"a line has at most {LINE_LIMIT_BYTES} bytes"))
         self._is_leaving = True
 
     def _take(self, line: bytes) -> None:
@@ -219,7 +219,7 @@ class _Client:
         try:
             request = parsed(line)
         except Refusal as refusal:
-            self._refuse(Request("line"), refusal)
+            self._refuse(SecopRequest("line"), refusal)
             self._is_leaving = self.is_stranger
             return
         if self.is_stranger and request.action not in ANSWERS and request.action != IDENTIFY:
@@ -257,7 +257,7 @@ class _Client:
             except Refusal as refusal:
                 self._refuse(request, refusal)
 
-    def _followed_now(self, request: Request) -> bytes:
+    def _followed_now(self, request: SecopRequest) -> bytes:
         """The answer to what changes whom it follows, b"" for anything else."""
         module = request.place[0]
         match request.action:
@@ -280,7 +280,7 @@ class _Client:
         """Whether one module is meant; Refusal when there is none of that name."""
         return bool(module and self._node.module(module))
 
-    def _refuse(self, request: Request, refusal: Refusal) -> None:
+    def _refuse(self, request: SecopRequest, refusal: Refusal) -> None:
         self._give(refused(request, refusal))
 
     def _give(self, line: bytes) -> None:

@@ -22,14 +22,14 @@ InterfaceClass = Literal["Readable", "Writable", "Drivable"]
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownValue:
     """A value. time_ns: when it was obtained, on the stand's clock; None: as long as the state says so."""
 
     value: JsonValue
     time_ns: int | None = None
 
 
-Report = Known | Refusal
+Report = KnownValue | Refusal
 
 
 class Drive:
@@ -60,7 +60,7 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ModuleView:
     """What parameters are read from."""
 
     state: StandState
@@ -73,16 +73,16 @@ class Seen:
             raise Refusal("ReadFailed", f"{channel} has not been read")
         return found
 
-    def number(self, channel: str) -> Known:
+    def number(self, channel: str) -> KnownValue:
         """The value of a channel; Refusal when it is BAD: never an old one."""
         reading = self.reading(channel)
         if reading.value is None:
             kind = "CommunicationFailed" if reading.cause == "wire" else "HardwareError"
             raise Refusal(kind, reading.reason or "this is no measurement")
-        return Known(reading.value, reading.time_ns)
+        return KnownValue(reading.value, reading.time_ns)
 
 
-class Order(NamedTuple):
+class ServiceOrder(NamedTuple):
     """A command of the stand's service, and the fields of its argument."""
 
     command: str
@@ -96,10 +96,10 @@ class Parameter:
 
     text: str
     info: DataInfo
-    read: Callable[[Seen], Known]
-    change: Callable[[JsonValue], Order] | None = None
+    read: Callable[[ModuleView], KnownValue]
+    change: Callable[[JsonValue], ServiceOrder] | None = None
 
-    def report(self, seen: Seen) -> Report:
+    def report(self, seen: ModuleView) -> Report:
         """What is read now."""
         try:
             return self.read(seen)
@@ -112,11 +112,11 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class ModuleCommand:
     """order: by the argument; None for what needs nothing to be done. is_stop: passes every queue."""
 
     text: str
-    order: Callable[[JsonValue], Order] | None
+    order: Callable[[JsonValue], ServiceOrder] | None
     argument: DataInfo | None = None
     result: DataInfo | None = None
     is_stop: bool = False
@@ -135,7 +135,7 @@ class Module:
     interface: InterfaceClass
     group: str
     parameters: Mapping[str, Parameter]
-    commands: Mapping[str, Command] = field(default_factory=dict[str, Command])
+    commands: Mapping[str, ModuleCommand] = field(default_factory=dict[str, ModuleCommand])
     device: str = ""
     read_ns: Callable[[StandState], int] = lambda state: state.now_ns
     is_read_after: bool = False
@@ -157,17 +157,17 @@ class Module:
         }
 
 
-def status(codes: Mapping[str, int], read: Callable[[Seen], tuple[int, str]]) -> Parameter:
+def status(codes: Mapping[str, int], read: Callable[[ModuleView], tuple[int, str]]) -> Parameter:
     """The parameter of that name."""
 
-    def reported(seen: Seen) -> Known:
+    def reported(seen: ModuleView) -> KnownValue:
         code, sentence = read(seen)
-        return Known([code, sentence])
+        return KnownValue([code, sentence])
 
     return Parameter("what it does, and why", datainfo.status(codes), reported)
 
 
-def measured(seen: Seen, channel: str) -> tuple[int, str]:
+def measured(seen: ModuleView, channel: str) -> tuple[int, str]:
     """The status of what is read from one channel."""
     reading = seen.state.readings.get(channel)
     if reading is None or reading.value is None:
@@ -175,7 +175,7 @@ def measured(seen: Seen, channel: str) -> tuple[int, str]:
     return (WARN, reading.reason) if reading.quality != "good" else (IDLE, "")
 
 
-def driven(seen: Seen, channel: str, read_ns: int) -> tuple[int, str]:
+def driven(seen: ModuleView, channel: str, read_ns: int) -> tuple[int, str]:
     """The status of what moves, but for what only the device itself knows."""
     code, sentence = measured(seen, channel)
     state = seen.state
@@ -192,6 +192,6 @@ def driven(seen: Seen, channel: str, read_ns: int) -> tuple[int, str]:
     return code, sentence
 
 
-def by_hand(device: str, verb: str, **arguments: JsonValue) -> Order:
+def by_hand(device: str, verb: str, **arguments: JsonValue) -> ServiceOrder:
     """An order to a device, through the gate of all that is done by hand."""
-    return Order("device", {"device": device, "verb": verb, "arguments": arguments})
+    return ServiceOrder("device", {"device": device, "verb": verb, "arguments": arguments})

@@ -22,18 +22,26 @@ from thermostand.foundation.errors import (
     StandTripped,
     Unreachable,
 )
-from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, Snapshot
+from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, StateSnapshot
 from thermostand.stand.serving.desk import Conflict, DeviceState, QueuedRun, StandState, Who
 from thermostand.stand.serving.secop.datainfo import taken
 from thermostand.stand.serving.secop.devices import modules
-from thermostand.stand.serving.secop.modules import Command, Drive, Known, Module, Order, Report, Seen
+from thermostand.stand.serving.secop.modules import (
+    Drive,
+    KnownValue,
+    Module,
+    ModuleCommand,
+    ModuleView,
+    Report,
+    ServiceOrder,
+)
 from thermostand.stand.serving.secop.secop_lines import (
     ANSWERS,
     IDENTIFICATION,
     IDENTIFY,
     ErrorClass,
     Refusal,
-    Request,
+    SecopRequest,
     message,
     report,
 )
@@ -99,13 +107,13 @@ class Node:
         """The line that tells a parameter's value, or why there is none."""
         return self._line("update", "error_update", place)
 
-    def is_stop(self, request: Request) -> bool:
+    def is_stop(self, request: SecopRequest) -> bool:
         """Whether this is STOP, which nothing may delay."""
         module, name = request.place
         command = self.modules[module].commands.get(name) if module in self.modules else None
         return request.action == "do" and command is not None and command.is_stop
 
-    async def stop(self, request: Request) -> bytes:
+    async def stop(self, request: SecopRequest) -> bytes:
         """STOP; Refusal when the control loop does not answer."""
         try:
             await self._bridge.stop(WHO)
@@ -115,7 +123,7 @@ class Node:
         self.look()
         return self._done(request, None)
 
-    async def answer(self, request: Request) -> bytes:
+    async def answer(self, request: SecopRequest) -> bytes:
         """The answer to all but `activate`, `deactivate` and STOP; Refusal."""
         match request.action:
             case "describe":
@@ -142,7 +150,7 @@ class Node:
             raise Refusal("NoSuchModule", f"there are {', '.join(self.modules)}")
         return self.modules[name]
 
-    async def _change(self, request: Request) -> bytes:
+    async def _change(self, request: SecopRequest) -> bytes:
         name, parameter = place = self._parameter(request, "target")
         module = self.modules[name]
         found = module.parameters[parameter]
@@ -152,7 +160,7 @@ class Node:
         await self._ordered(found.change(value), name, value)
         return self._line("changed", "error_change", place, request.specifier)
 
-    async def _do(self, request: Request) -> bytes:
+    async def _do(self, request: SecopRequest) -> bytes:
         name, word = request.place
         module = self.module(name)
         command = module.commands.get(word)
@@ -166,7 +174,7 @@ class Node:
         came = await self._ordered(command.order(argument), name, None)
         return self._done(request, came.id if isinstance(came, QueuedRun) else None)
 
-    def _argument(self, command: Command, request: Request) -> JsonValue:
+    def _argument(self, command: ModuleCommand, request: SecopRequest) -> JsonValue:
         value = request.value()
         if command.argument is not None:
             return taken(command.argument, value)
@@ -174,7 +182,7 @@ class Node:
             raise Refusal("WrongType", "this command takes no argument")
         return None
 
-    async def _ordered(self, order: Order, name: str, target: JsonValue) -> BaseModel:
+    async def _ordered(self, order: ServiceOrder, name: str, target: JsonValue) -> BaseModel:
         """What came of it; what it changes at once has been sent when this returns."""
 
         module, began_ns = self.modules[name], self._bridge.snapshot.state.now_ns
@@ -196,7 +204,7 @@ class Node:
         self.look()
         return came
 
-    def _parameter(self, request: Request, default: str) -> Place:
+    def _parameter(self, request: SecopRequest, default: str) -> Place:
         name, parameter = request.place
         module = self.module(name)
         parameter = parameter or default
@@ -204,14 +212,14 @@ class Node:
             raise Refusal("NoSuchParameter", f"{name} has {', '.join(module.parameters)}")
         return name, parameter
 
-    def _has_changed(self, snapshot: Snapshot, name: str, parameter: str) -> bool:
+    def _has_changed(self, snapshot: StateSnapshot, name: str, parameter: str) -> bool:
         place, state = (name, parameter), snapshot.state
-        seen = Seen(state, self._drives[name])
+        seen = ModuleView(state, self._drives[name])
         now = _SILENT if snapshot.age_s > _OLD_S else self.modules[name].parameters[parameter].report(seen)
         before = self._reported.get(place)
         if before is not None and before.report == now:
             return False
-        time_ns = now.time_ns if isinstance(now, Known) else None
+        time_ns = now.time_ns if isinstance(now, KnownValue) else None
         self._reported[place] = _Reported(now, _utc_s(state, state.now_ns if time_ns is None else time_ns))
         return True
 
@@ -222,7 +230,7 @@ class Node:
             return message(error_word, specifier, [last.report.error, last.report.text, qualifiers])
         return message(word, specifier, report(last.report.value, last.t_s))
 
-    def _done(self, request: Request, result: JsonValue) -> bytes:
+    def _done(self, request: SecopRequest, result: JsonValue) -> bytes:
         return message("done", request.specifier, report(result, self._now_s()))
 
     def _now_s(self) -> float:

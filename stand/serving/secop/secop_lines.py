@@ -65,7 +65,7 @@ class Refusal(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class SecopRequest:
     """A line: `action [specifier [data]]`. data: JSON as it came, "" for none."""
 
     action: str
@@ -88,7 +88,7 @@ class Request:
             raise Refusal("BadJSON", "the data is no JSON value") from None
 
 
-def parsed(line: bytes) -> Request:
+def parsed(line: bytes) -> SecopRequest:
     """A line without its end; a CR before that is left out. An empty one asks for help. Refusal when it is no UTF-8."""
     try:
         text = line.removesuffix(b"\r").decode()
@@ -96,7 +96,7 @@ def parsed(line: bytes) -> Request:
         raise Refusal("ProtocolError", "a line is UTF-8") from None
     action, _, rest = text.partition(" ")
     specifier, _, data = rest.partition(" ")
-    return Request(action or "help", specifier, data)
+    return SecopRequest(action or "help", specifier, data)
 
 
 def message(action: str, specifier: str = "", content: object = None) -> bytes:
@@ -112,7 +112,7 @@ def report(value: object, t_s: float) -> list[object]:
     return [value, {"t": round(t_s, 6)}]
 
 
-def refused(request: Request, refusal: Refusal) -> bytes:
+def refused(request: SecopRequest, refusal: Refusal) -> bytes:
     """The answer to what is refused."""
     action = f"error_{request.action[:_ECHO]}"
     return message(action, request.specifier[:_ECHO], [refusal.error, refusal.text, {}])

@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 
     from thermostand.foundation.patience import Patience
     from thermostand.recording.writing.disk import DiskCalls
-    from thermostand.stand.queueing.host import Host
-    from thermostand.stand.queueing.orders import Orders
     from thermostand.stand.running.course import Course
+    from thermostand.stand.service.host import Host
+    from thermostand.stand.service.orders import Orders
 
 _NOTHING_RUNS = "nothing is run now"
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"

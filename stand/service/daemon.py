@@ -36,16 +36,8 @@ from thermostand.foundation.items import Event, Item
 from thermostand.foundation.tasks import cancelled, failure_text, watched
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.daemon import systemd
-from thermostand.stand.daemon.daemon_file import Counters, Kept, KeptFile
-from thermostand.stand.daemon.day_record import DayRecord
 from thermostand.stand.estimating.learned import learn
 from thermostand.stand.fault import Fault
-from thermostand.stand.queueing.host import Host
-from thermostand.stand.queueing.orders import Orders, said_of
-from thermostand.stand.queueing.queue_file import Entry
-from thermostand.stand.queueing.queue_work import Halt, Notes, Stopped, Watch, drain, interruption_of, is_complete
-from thermostand.stand.run import run_in
 from thermostand.stand.running.course import keep
 from thermostand.stand.running.executing.settling_watch import load_for
 from thermostand.stand.running.guest import Job
@@ -53,7 +45,15 @@ from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import STOPPED, Stop, catch_signals
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
 from thermostand.stand.running.resume import Interruption, repaired
-from thermostand.stand.service import StandService
+from thermostand.stand.service import systemd
+from thermostand.stand.service.daemon_file import Counters, KeptCounters, KeptFile
+from thermostand.stand.service.day_record import DayRecord
+from thermostand.stand.service.host import Host
+from thermostand.stand.service.orders import Orders, said_of
+from thermostand.stand.service.queue_file import QueueEntry
+from thermostand.stand.service.queue_work import Halt, RunNotes, StepWatch, Stopped, drain, interruption_of, is_complete
+from thermostand.stand.service.run import run_in
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.desk import Conflict, QueuedRun, Who
 
 # What answers the clients of a stand while inside.
@@ -74,7 +74,7 @@ class Daemon(Host):
         open_stand: OpenStand,
         orders: Orders,
         record: DayRecord,
-        kept: Kept,
+        kept: KeptCounters,
         keep: KeptFile,
         recorded: Callable[[Path], None] | None = None,
     ) -> None:
@@ -147,7 +147,7 @@ class Daemon(Host):
 
     def note(self) -> None:
         """Counters are kept for the next start."""
-        self._keep.note(Kept(counters=dict(self.counters.values)))
+        self._keep.note(KeptCounters(counters=dict(self.counters.values)))
 
     def clear_queue(self) -> None:
         """What halted it has been looked into."""
@@ -247,7 +247,7 @@ class Daemon(Host):
         self._tell(RECORDING_RESTARTED, session=session)
         self.wake()
 
-    async def _run_one(self, entry: Entry, notes: Notes) -> Path:
+    async def _run_one(self, entry: QueueEntry, notes: RunNotes) -> Path:
         if self._orders.leaving:
             raise Interrupted("the daemon ends")
         if self.open_stand.latch.fault is not None:
@@ -285,7 +285,7 @@ class Daemon(Host):
             self.note()
             self._status.tell(self.by_hand.doing)
 
-    async def _perform(self, entry: Entry, notes: Notes, begun: Callable[[], None]) -> Path:
+    async def _perform(self, entry: QueueEntry, notes: RunNotes, begun: Callable[[], None]) -> Path:
         """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
         without the record between runs. Raises as a run does, Stopped when an operator has stopped it: who presses
         stop does not want the next one to begin."""
@@ -295,7 +295,7 @@ class Daemon(Host):
             return session  # killed between its end and the note of it
         order = await orders.reading.call(orders.order_of, entry)
         before = None if session is None else await self._interruption(session, order.config)
-        watch = Watch(frozenset() if before is None else before.kept.done, notes.step_done)
+        watch = StepWatch(frozenset() if before is None else before.kept.done, notes.step_done)
 
         async def recorded(folder: Path) -> None:
             await notes.begun(folder)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.files import make_folder
-from thermostand.stand.queueing.queue_file import Entry, Queue, State, changing, read_queue
+from thermostand.stand.service.queue_file import Queue, QueueEntry, QueueState, changing, read_queue
 
 if TYPE_CHECKING:
     from thermostand.stand.running.order import Order
 
 
-def order_of(entry: Entry) -> Order:
+def order_of(entry: QueueEntry) -> Order:
     """What an entry asks for; ConfigError when this version of the program refuses it."""
     # The process that touches the disk for a daemon loads this module, and needs none of that.
     from thermostand.stand.estimating.estimate import price
@@ -47,9 +47,9 @@ class Asked:
     tags: tuple[str, ...] = ()
 
 
-def entry_of(order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> Entry:
+def entry_of(order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> QueueEntry:
     """What is to be queued; `config` is the name of its configuration, for messages. Its number is given later."""
-    return Entry(
+    return QueueEntry(
         id=1,
         recipe=order.recipe.name,
         config=config,
@@ -62,7 +62,7 @@ def entry_of(order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> 
     )
 
 
-def append(directory: Path, entry: Entry) -> Entry:
+def append(directory: Path, entry: QueueEntry) -> QueueEntry:
     """Queue it behind all others, with a number of its own. With the key of an earlier run: that one. SessionError
     when the request of that key was another."""
     make_folder(directory)
@@ -90,17 +90,17 @@ def move(directory: Path, number: int, position: int) -> None:
         draft.set(entries=(*(other for other in draft.queue.entries if not other.is_open), *rest))
 
 
-def remove(directory: Path, number: int) -> Entry:
+def remove(directory: Path, number: int) -> QueueEntry:
     """Take a run out of the queue, in any state but running; its session stays. SessionError when it is running."""
     with changing(directory) as draft:
         entry = draft.entry(number)
-        if entry.state is State.RUNNING:
+        if entry.state is QueueState.RUNNING:
             raise SessionError(f"run {number} is running; `stand stop` ends it")
         draft.set(entries=tuple(other for other in draft.queue.entries if other.id != number))
     return entry
 
 
-def take(directory: Path, now_ns: int) -> Entry | None:
+def take(directory: Path, now_ns: int) -> QueueEntry | None:
     """The next run, marked as running, as it was before: an interrupted one has its session. None when all are done.
 
     StandTripped when the queue was halted and no operator has cleared it.
@@ -110,13 +110,13 @@ def take(directory: Path, now_ns: int) -> Entry | None:
         if queue.halted:
             remedy = "remove the cause, then `stand clear`"
             raise StandTripped(f"{directory}: the queue was halted: {queue.halted}; {remedy}")
-        running = next((entry for entry in queue.entries if entry.state is State.RUNNING), None)
+        running = next((entry for entry in queue.entries if entry.state is QueueState.RUNNING), None)
         if running is not None:
             raise SessionError(f"run {running.id} is running; one at a time")
         entry = next((entry for entry in queue.entries if entry.is_open), None)
         if entry is not None:
             changes = {
-                "state": State.RUNNING,
+                "state": QueueState.RUNNING,
                 "began_ns": entry.began_ns if entry.session else now_ns,
                 "reason": "",
                 "fruitless_starts": entry.fruitless_starts + 1,
@@ -137,11 +137,13 @@ def note_step(directory: Path, number: int) -> None:
         draft.put(draft.entry(number).model_copy(update={"fruitless_starts": 0}))
 
 
-def finish(directory: Path, number: int, state: State, now_ns: int, reason: str = "", *, halt: bool = False) -> None:
+def finish(
+    directory: Path, number: int, state: QueueState, now_ns: int, reason: str = "", *, halt: bool = False
+) -> None:
     """The run under way has ended; with `halt` nothing is begun before an operator says so."""
     with changing(directory) as draft:
         changes = {"state": state, "ended_ns": now_ns, "reason": reason}
-        if state is State.INTERRUPTED:
+        if state is QueueState.INTERRUPTED:
             changes["fruitless_starts"] = 0  # by an operator, who may do so as often as he likes
         draft.put(draft.entry(number).model_copy(update=changes))
         if halt:
@@ -154,7 +156,7 @@ def halt(directory: Path, reason: str) -> None:
         draft.set(halted=draft.queue.halted or reason)
 
 
-def put_first(directory: Path, entry: Entry, session: str) -> Entry:
+def put_first(directory: Path, entry: QueueEntry, session: str) -> QueueEntry:
     """Resume the run of that session next: an entry that has it is interrupted again, else `entry` is. What halted the
     queue is cleared: an operator has asked for this."""
     with changing(directory) as draft:
@@ -162,7 +164,7 @@ def put_first(directory: Path, entry: Entry, session: str) -> Entry:
         known: dict[str, object] = {"id": draft.queue.next_id, "began_ns": entry.added_ns}
         if found is not None:
             known = {"id": found.id, "added_ns": found.added_ns, "began_ns": found.began_ns, "attended": found.attended}
-        entry = entry.model_copy(update={**known, "state": State.INTERRUPTED, "session": session})
+        entry = entry.model_copy(update={**known, "state": QueueState.INTERRUPTED, "session": session})
         rest = [each for each in draft.queue.entries if each.id != entry.id]
         ended, waiting = [e for e in rest if not e.is_open], [e for e in rest if e.is_open]
         draft.set(next_id=max(draft.queue.next_id, entry.id + 1), entries=(*ended, entry, *waiting), halted="")

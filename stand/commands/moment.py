@@ -9,10 +9,10 @@ from typing import cast
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.instants import local_text
+from thermostand.stand.commands.remedies import next_command
 from thermostand.stand.gate import IN_WORDS
 from thermostand.stand.serving.client import API, Server
 from thermostand.stand.serving.desk import StandState
-from thermostand.stand.watching.remedies import next_command
 
 # Follows a stand from a daemon's HTTP interface.
 
@@ -39,7 +39,7 @@ class There:
         self._seq = max(self._seq, cast("int", answer.get("seq", 0)))
         return cast("list[EventData]", answer.get("events", []))
 
-    def moment(self, state: StandState) -> Moment:
+    def moment(self, state: StandState) -> ShownMoment:
         """What is shown of a state."""
         self._know(state)
         return moment_of(state, None if state.run is None else self._drift_px())
@@ -74,7 +74,7 @@ SET_POINT, AIR, CAMERA = "regulator.sp", "thermometers.air", "camera.temperature
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class ShownMoment:
     """now_ns, end_ns: UTC, ns since the epoch. share: how much of the run is done, 0..1, None without one. step: number
     of the step under way, 0 before the first; doing: that step in words. held: what holds the run, in words. A
     temperature that is BAD or unknown is None, as all else that is not known. end_within_s: by how much the end may
@@ -100,7 +100,7 @@ class Moment:
     end_within_s: float | None = None
 
 
-def moment_of(state: StandState, drift_px: float | None = None) -> Moment:
+def moment_of(state: StandState, drift_px: float | None = None) -> ShownMoment:
     """Of a stand as its daemon tells it."""
     offset_ns, run = state.utc_offset_ns, state.run
     held = held_by(state.reasons)
@@ -109,7 +109,7 @@ def moment_of(state: StandState, drift_px: float | None = None) -> Moment:
         waiting = sum(each.state == "waiting" for each in state.queue)
         queued = f"{waiting} queued" if waiting else ""
         doing = "; ".join(part for part in ("no run", heat_by_hand(state), queued) if part)
-        return Moment(
+        return ShownMoment(
             state.now_ns + offset_ns,
             state.stand,
             doing=doing,
@@ -119,7 +119,7 @@ def moment_of(state: StandState, drift_px: float | None = None) -> Moment:
             air_degC=air_degC,
             camera_degC=camera_degC,
         )
-    return Moment(
+    return ShownMoment(
         run.now_ns + run.utc_offset_ns,
         f"{run.recipe} on {state.stand}",
         share_done(state),

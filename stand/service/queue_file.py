@@ -35,7 +35,7 @@ _WORKER_NAME = ".queue.worker"
 _REMEDY = f"{LAST_NAME} beside it is the queue before its last change: rename it to {QUEUE_NAME}, or move both away"
 
 
-class State(StrEnum):
+class QueueState(StrEnum):
     """Where a queued run is. Waiting and interrupted ones are still to be done, the interrupted one first. An operator
     who stops a run of a daemon ends it: it is resumed only when asked for."""
 
@@ -54,7 +54,7 @@ def _folder_name(name: str) -> str:
     return name
 
 
-class Entry(Document):
+class QueueEntry(Document):
     """One run. The texts are those of the files when it was added: a later edit does not change what is queued.
 
     config: the file its text is from, for messages. Instants are ns since the epoch on the host's clock. session: the
@@ -70,7 +70,7 @@ class Entry(Document):
     config_text: str
     recipe_text: str
     target_text: str
-    state: State = State.WAITING
+    state: QueueState = QueueState.WAITING
     added_ns: int
     began_ns: int | None = None
     ended_ns: int | None = None
@@ -87,7 +87,7 @@ class Entry(Document):
     @property
     def is_open(self) -> bool:
         """Whether it is still to be done."""
-        return self.state in (State.WAITING, State.INTERRUPTED)
+        return self.state in (QueueState.WAITING, QueueState.INTERRUPTED)
 
 
 class Queue(Document):
@@ -101,7 +101,7 @@ class Queue(Document):
     next_id: int = Field(default=1, ge=1)
     changes: int = Field(default=0, ge=0)
     halted: str = ""
-    entries: tuple[Entry, ...] = ()
+    entries: tuple[QueueEntry, ...] = ()
 
 
 class Draft:
@@ -110,14 +110,14 @@ class Draft:
     def __init__(self, queue: Queue) -> None:
         self.queue = queue
 
-    def entry(self, number: int) -> Entry:
+    def entry(self, number: int) -> QueueEntry:
         """The entry of this number; SessionError when there is none."""
         for entry in self.queue.entries:
             if entry.id == number:
                 return entry
         raise SessionError(f"no run {number} in the queue; `stand queue list` shows those there are")
 
-    def put(self, entry: Entry) -> None:
+    def put(self, entry: QueueEntry) -> None:
         """Replace the entry of the same number."""
         self.set(entries=tuple(entry if old.id == entry.id else old for old in self.queue.entries))
 
@@ -168,7 +168,7 @@ def worked_on(directory: Path) -> ExitStack:
 
 def _pruned(queue: Queue) -> Queue:
     """Without all but the latest of the runs that have ended."""
-    ended = [entry.id for entry in queue.entries if not entry.is_open and entry.state is not State.RUNNING]
+    ended = [entry.id for entry in queue.entries if not entry.is_open and entry.state is not QueueState.RUNNING]
     old = frozenset(ended[:-KEPT_ENDED])
     return queue.model_copy(update={"entries": tuple(entry for entry in queue.entries if entry.id not in old)})
 
@@ -182,12 +182,12 @@ def _settled(directory: Path, queue: Queue) -> Queue:
 
 
 def _running(queue: Queue) -> bool:
-    return any(entry.state is State.RUNNING for entry in queue.entries)
+    return any(entry.state is QueueState.RUNNING for entry in queue.entries)
 
 
 def _interrupted(queue: Queue) -> Queue:
-    cut = {"state": State.INTERRUPTED, "reason": "its daemon was killed"}
-    entries = (entry.model_copy(update=cut) if entry.state is State.RUNNING else entry for entry in queue.entries)
+    cut = {"state": QueueState.INTERRUPTED, "reason": "its daemon was killed"}
+    entries = (entry.model_copy(update=cut) if entry.state is QueueState.RUNNING else entry for entry in queue.entries)
     return queue.model_copy(update={"entries": tuple(entries)})
 
 

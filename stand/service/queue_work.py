@@ -23,18 +23,18 @@ from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.patience import Patience
 from thermostand.recording.writing.disk import DiskCalls
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.queueing.queue import finish, note_session, note_step, queued, take
-from thermostand.stand.queueing.queue_file import Entry, State
 from thermostand.stand.running.memory.entries import Ended
 from thermostand.stand.running.memory.journal import Journal
 from thermostand.stand.running.resume import Interruption, interruption
+from thermostand.stand.service.queue import finish, note_session, note_step, queued, take
+from thermostand.stand.service.queue_file import QueueEntry, QueueState
 
 MOST_FRUITLESS_STARTS = 3
 _NOTED_WITHIN_S = 1.0  # real seconds that a disk may take for the note of a run's end; it is written later, then
 
 
 @dataclass(frozen=True, slots=True)
-class Notes:
+class RunNotes:
     """What a run reports while it is under way.
 
     begun: its session's folder, as soon as a run that is killed could be resumed in it; noted when it returns.
@@ -46,7 +46,7 @@ class Notes:
 
 
 # Runs the entry, or resumes it when it has a session, and returns the session's folder.
-RunOne = Callable[[Entry, Notes], Awaitable[Path]]
+RunOne = Callable[[QueueEntry, RunNotes], Awaitable[Path]]
 
 
 async def drain(
@@ -86,7 +86,7 @@ class _Run:
     def __init__(
         self,
         directory: Path,
-        entry: Entry,
+        entry: QueueEntry,
         clock: Now,
         tell: Callable[[str], None],
         disk: DiskCalls,
@@ -106,35 +106,35 @@ class _Run:
         """Fail without another try."""
         left = f"; `stand resume {self._directory / self._entry.session}` tries again" if self._entry.session else ""
         times = f"{self._entry.fruitless_starts} times in a row"
-        await self._end(State.FAILED, f"its daemon was killed {times} before one more step was done{left}")
+        await self._end(QueueState.FAILED, f"its daemon was killed {times} before one more step was done{left}")
 
     async def perform(self, run_one: RunOne) -> None:
         """Run or resume it; raises what ends the work."""
         entry = self._entry
         self._tell(f"{self._name} " + (f"is resumed in {entry.session}" if entry.session else "begins"))
         try:
-            session = await run_one(entry, Notes(self._note_session, self._note_step))
+            session = await run_one(entry, RunNotes(self._note_session, self._note_step))
         except (Interrupted, InUse, asyncio.CancelledError) as error:
-            await self._end(State.INTERRUPTED, str(error) or "stopped by the operator")
+            await self._end(QueueState.INTERRUPTED, str(error) or "stopped by the operator")
             raise
         except Stopped as error:
-            await self._end(State.STOPPED, str(error), halt=error.halts)
+            await self._end(QueueState.STOPPED, str(error), halt=error.halts)
             if error.halts:
                 raise
         except (StandTripped, Halt) as error:
-            await self._end(State.FAILED, str(error), halt=True)
+            await self._end(QueueState.FAILED, str(error), halt=True)
             raise
         except StandError as error:
             halt = isinstance(error, DeviceError) and not await self._has_session()
-            await self._end(State.FAILED, str(error), halt=halt)
+            await self._end(QueueState.FAILED, str(error), halt=halt)
             if halt:
                 raise
         except Exception as error:
-            await self._end(State.FAILED, f"{type(error).__name__}: {error}", halt=True)
+            await self._end(QueueState.FAILED, f"{type(error).__name__}: {error}", halt=True)
             raise
         else:
             await self._note_session(session)
-            await self._end(State.DONE)
+            await self._end(QueueState.DONE)
 
     async def _has_session(self) -> bool:
         await self._noted()
@@ -160,7 +160,7 @@ class _Run:
     async def _noted(self) -> None:
         await asyncio.gather(*self._notes)
 
-    async def _end(self, state: State, reason: str = "", *, halt: bool = False) -> None:
+    async def _end(self, state: QueueState, reason: str = "", *, halt: bool = False) -> None:
         """Noted when the disk takes that in time: one that hangs keeps nobody from leaving."""
         sentence = f"{self._name} {state}" + (f": {reason}" if reason else "")
         now_ns = self._clock.now_ns()
@@ -180,7 +180,7 @@ class _Run:
         await self._disk.call(change)
 
 
-class Watch:
+class StepWatch:
     """Reports steps that were not done before, and keeps which actuators have not confirmed their safe state."""
 
     def __init__(self, done: Collection[str], step_done: Callable[[], None]) -> None:

@@ -95,7 +95,7 @@ _KIND = "counters"
 _CLOSE_LIMIT_S = 1.0
 
 
-class Kept(BaseModel):
+class KeptCounters(BaseModel):
     """The file. counters: by name, see counters.py."""
 
     model_config = ConfigDict(frozen=True)
@@ -103,20 +103,20 @@ class Kept(BaseModel):
     counters: dict[str, float] = Field(default_factory=dict)
 
 
-def kept_in(directory: Path) -> tuple[Kept, str]:
+def kept_in(directory: Path) -> tuple[KeptCounters, str]:
     """What a daemon before has left, and what is wrong with it, as a sentence: a damaged file is kept beside it, and
     the counters begin again. Blocking."""
     path = directory / NAME
     try:
-        return Kept.model_validate_json(unseal(_KIND, path.read_bytes())), ""
+        return KeptCounters.model_validate_json(unseal(_KIND, path.read_bytes())), ""
     except FileNotFoundError:
-        return Kept(), ""
+        return KeptCounters(), ""
     except (OSError, ValueError) as error:
         aside = path.with_name(f"{NAME}.damaged")
         with suppress(OSError):
             path.replace(aside)
         why = error.strerror if isinstance(error, OSError) else "it is damaged"
-        return Kept(), f"{path}: cannot be read ({why}), and is {aside.name} now; the counters begin again at 0"
+        return KeptCounters(), f"{path}: cannot be read ({why}), and is {aside.name} now; the counters begin again at 0"
 
 
 class KeptFile:
@@ -131,10 +131,10 @@ class KeptFile:
         self._hub = hub
         self._clock = clock
         self._lane = Lane("daemon-file", clock, patient=False)
-        self._waiting: Kept | None = None
+        self._waiting: KeptCounters | None = None
         self._writing: asyncio.Task[None] | None = None
 
-    def note(self, kept: Kept) -> None:
+    def note(self, kept: KeptCounters) -> None:
         """Write it as soon as the disk takes it; returns at once."""
         self._waiting = kept
         if self._writing is None or self._writing.done():

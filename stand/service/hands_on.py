@@ -28,9 +28,9 @@ from thermostand.foundation.repeats import RepeatLimit
 from thermostand.recording.format.images import encode_png
 from thermostand.stand.assembly import Assembly, assemble, register_map
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.queueing.by_hand import ByHand
 from thermostand.stand.running.opening.open_stand import at_bench, made_safe
 from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.service.by_hand import ByHand
 from thermostand.stand.serving.desk import Argument, Conflict, DeviceState, DeviceVerb
 
 COMMAND = "stand device"
@@ -39,7 +39,7 @@ _OPEN_S = 10.0  # that a flap stays open
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class HandResult:
     """What came of it: lines for people, and the same as data."""
 
     lines: Sequence[str]
@@ -64,7 +64,7 @@ def _looks(config: StandConfig, device: DeviceState) -> Iterator[DeviceVerb]:
 
 async def by_hand(
     config: StandConfig, name: str, verb: str, arguments: Mapping[str, JsonValue], out: Path | None, tell: Tell
-) -> Done:
+) -> HandResult:
     """Do it. ConfigError and Missing for what the device does not know, Conflict for what needs a daemon, InUse when
     another program has the stand: then nothing was touched."""
     arguments = dict(arguments)
@@ -86,7 +86,7 @@ async def by_hand(
             clock = hands.assembly.clock
             await clock.sleep_until(clock.now_ns() + seconds_ns(open_s))
         done = _readings(await device.read())
-        return Done([f"{name}: {verb}", *done.lines], done.data)
+        return HandResult([f"{name}: {verb}", *done.lines], done.data)
 
 
 Tell = Callable[[str], None]
@@ -126,7 +126,7 @@ class _Hands:
             assembly.stand.opened(cast("Actuator", device))
         return device
 
-    async def grab(self, name: str, arguments: Mapping[str, JsonValue], out: Path | None) -> Done:
+    async def grab(self, name: str, arguments: Mapping[str, JsonValue], out: Path | None) -> HandResult:
         """One frame, as a PNG in `out` when that is given; flap=open: through the flap, which is shut again."""
         camera = self.assembly.devices.cameras.get(name)
         if camera is None:
@@ -153,7 +153,7 @@ class _Hands:
         text = (
             f"{name}: {width} x {height}, grey {data['darkest']} to {data['brightest']}, mean {data['mean_grey']}{kept}"
         )
-        return Done([text], data)
+        return HandResult([text], data)
 
 
 @asynccontextmanager
@@ -176,16 +176,16 @@ def _no_heat() -> None:
     raise Conflict("heat needs a recording and a guard that look after it: `stand serve`, then the same command again")
 
 
-def _readings(readings: Sequence[Reading]) -> Done:
+def _readings(readings: Sequence[Reading]) -> HandResult:
     lines = [
         f"{each.channel:<28}{each.value:>12.5g} {'' if each.unit == '1' else each.unit:<6}{each.quality.name.lower()}"
         f"{f': {each.reason}' if each.reason else ''}"
         for each in readings
     ]
-    return Done(lines or ["it reads nothing"], [asdict(each) for each in readings])
+    return HandResult(lines or ["it reads nothing"], [asdict(each) for each in readings])
 
 
-async def _registers(assembly: Assembly, name: str) -> Done:
+async def _registers(assembly: Assembly, name: str) -> HandResult:
     """Every point of the unit's register map, read one by one; what cannot be read says why."""
     _, kind, settings = next(each for each in assembly.equipment if each.name == name)
     if not isinstance(settings, OnBus):
@@ -206,4 +206,4 @@ async def _registers(assembly: Assembly, name: str) -> Done:
         shown = sample.reason or f"{sample.value:g}{'' if point.unit == '1' else f' {point.unit}'}"
         lines.append(f"{where}  {sample.raw:#06x}  {shown}{remark}")
         data[point_name] = {"raw": sample.raw, "value": None if math.isnan(sample.value) else sample.value}
-    return Done(lines, data)
+    return HandResult(lines, data)

@@ -29,7 +29,7 @@ _STATE = ("phase", "setpoint_degC", "output_percent", "heater_permitted", "compr
 Picture = Callable[[], tuple[int, bytes] | None]
 
 
-class Published:
+class FoxgloveServer:
     """Publishes at a port until it is closed. Viewers can read, and nothing else."""
 
     def __init__(self, name: str, port: int) -> None:

@@ -12,10 +12,10 @@ from pydantic import JsonValue
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.events import BY_HAND_FAILED, EventKind
 from thermostand.foundation.tasks import failure_text
-from thermostand.stand.queueing.by_hand import ByHand
-from thermostand.stand.queueing.orders import Orders
 from thermostand.stand.running.guest import Guest
 from thermostand.stand.running.opening.open_stand import OpenStand
+from thermostand.stand.service.by_hand import ByHand
+from thermostand.stand.service.orders import Orders
 from thermostand.stand.serving.desk import Conflict, DeviceState, HeatByHand, QueuedRun
 
 _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on

@@ -29,15 +29,15 @@ from thermostand.stand.assembly import assemble
 from thermostand.stand.config.checked import ATTACHMENT
 from thermostand.stand.config.safe_ranges import accepted_text
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.daemon.daemon import Daemon, Front
-from thermostand.stand.daemon.daemon_file import KeptFile, kept_in
-from thermostand.stand.daemon.day_record import DayRecord
-from thermostand.stand.queueing.orders import Orders
 from thermostand.stand.running.opening.claim import claimed
 from thermostand.stand.running.opening.clock_watch import ClockWatch
 from thermostand.stand.running.opening.open_stand import opened
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.session_report import report_session
+from thermostand.stand.service.daemon import Daemon, Front
+from thermostand.stand.service.daemon_file import KeptFile, kept_in
+from thermostand.stand.service.day_record import DayRecord
+from thermostand.stand.service.orders import Orders
 from thermostand.stand.serving.alerts import alerting
 from thermostand.stand.serving.preview_process import MODULE
 

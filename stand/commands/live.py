@@ -25,14 +25,14 @@ from thermostand.foundation.instants import duration, local_text
 from thermostand.foundation.items import Batch, Event, Item, StepMark
 from thermostand.foundation.output import output
 from thermostand.foundation.usage import one_line
+from thermostand.stand.commands.moment import ShownMoment, event_line, moment_of
 from thermostand.stand.estimating.run_estimate import Night
 from thermostand.stand.gate import HELD, RELEASED
-from thermostand.stand.run import Front, by_socket
-from thermostand.stand.service import StandService
+from thermostand.stand.service.run import Front, by_socket
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.commands import Served
 from thermostand.stand.serving.front import front
-from thermostand.stand.watching.moment import Moment, event_line, moment_of
 
 # Output for people, written by a thread of its own: a terminal or a log that blocks delays nothing else.
 
@@ -86,30 +86,30 @@ def aside() -> Generator[Aside]:
 _BAR = 24
 
 
-def panel_lines(moment: Moment) -> list[str]:
+def panel_lines(moment: ShownMoment) -> list[str]:
     """What stands in the panel, a line for each question: what, how warm, what has been seen, how long."""
     lines = [_step(moment), "   ".join(_temperatures(moment)), "   ".join(_recorded(moment)), _end(moment)]
     return [one_line(line) for line in lines if line]
 
 
-def plain_line(moment: Moment) -> str:
+def plain_line(moment: ShownMoment) -> str:
     """The same in one line, for a log."""
     parts = [_step(moment), ", ".join(_temperatures(moment)), ", ".join(_recorded(moment)), _ends(moment)]
     share = "" if moment.share is None else f"{moment.share:4.0%}  "
     return one_line(f"run: {share}{local_text(moment.now_ns)[:16]}  {'; '.join(part for part in parts if part)}")
 
 
-def _step(moment: Moment) -> str:
+def _step(moment: ShownMoment) -> str:
     number = f"step {moment.step} of {moment.steps}: " if moment.steps else ""
     return f"{number}{moment.doing}" + (f" ({moment.held})" if moment.held else "")
 
 
-def _temperatures(moment: Moment) -> list[str]:
+def _temperatures(moment: ShownMoment) -> list[str]:
     named = (("set", moment.setpoint_degC), ("air", moment.air_degC), ("camera", moment.camera_degC))
     return [f"{name} {'–' if value is None else f'{value:.2f} °C'}" for name, value in named]
 
 
-def _recorded(moment: Moment) -> list[str]:
+def _recorded(moment: ShownMoment) -> list[str]:
     planned = moment.frames_planned
     of = f" of {planned}" if planned is not None and planned >= moment.frames else ""
     parts = [f"frames {moment.frames}{of}"] if moment.steps else []
@@ -122,7 +122,7 @@ def _recorded(moment: Moment) -> list[str]:
     return parts
 
 
-def _ends(moment: Moment) -> str:
+def _ends(moment: ShownMoment) -> str:
     if moment.end_ns is None:
         return ""
     within = "" if moment.end_within_s is None else f" ± {_minutes(moment.end_within_s)}"
@@ -131,7 +131,7 @@ def _ends(moment: Moment) -> str:
     return f"ends {local_text(moment.end_ns)[:16]}{zone}{within} (in {left})"
 
 
-def _end(moment: Moment) -> str:
+def _end(moment: ShownMoment) -> str:
     if moment.share is None:
         return _ends(moment)
     done = round(_BAR * moment.share)
@@ -156,19 +156,19 @@ def view(*, is_virtual: bool = False) -> Generator[View]:
     if output().quiet:
         yield Silent()
     elif not sys.stderr.isatty():
-        yield Lines(WallClock(), is_virtual=is_virtual)
+        yield PlainLines(WallClock(), is_virtual=is_virtual)
     else:
         with _foot(WallClock()) as foot:
             yield foot
 
 
-class Following:
+class RunFollower:
     """Shows a run of this process, as its service tells: messages from its hub, from the first on, and how it stands
     from the moment on at which it answers. show, tell: make a View's calls, and keep nobody waiting."""
 
     def __init__(
         self,
-        show: Callable[[Moment], None],
+        show: Callable[[ShownMoment], None],
         tell: Callable[[str], None],
         sessions: Path,
         night_s: float = 0.0,
@@ -228,17 +228,17 @@ class Following:
 
 
 @contextmanager
-def followed(night: Night, sessions: Path, *, is_virtual: bool) -> Generator[Following]:
+def followed(night: Night, sessions: Path, *, is_virtual: bool) -> Generator[RunFollower]:
     """What shows a run of this process while inside, by a thread of its own, for which the run never waits. sessions:
     the folder of its session's."""
     with view(is_virtual=is_virtual) as shown, aside() as later:
-        yield Following(later(shown.show), later(shown.tell), sessions, night.duration_s, tells_all=output().verbose)
+        yield RunFollower(later(shown.show), later(shown.tell), sessions, night.duration_s, tells_all=output().verbose)
 
 
 class Silent:
     """Errors only."""
 
-    def show(self, moment: Moment) -> None:
+    def show(self, moment: ShownMoment) -> None:
         """Nothing."""
 
     def tell(self, line: str) -> None:
@@ -247,7 +247,7 @@ class Silent:
             typer.echo(one_line(line), err=True)
 
 
-class Lines:
+class PlainLines:
     """For a file or a pipe: a line when the run begins, and then each minute, or at each tenth in virtual time."""
 
     def __init__(self, clock: Now, *, is_virtual: bool) -> None:
@@ -256,7 +256,7 @@ class Lines:
         self._next_ns = 0
         self._next_share = _TENTH
 
-    def show(self, moment: Moment) -> None:
+    def show(self, moment: ShownMoment) -> None:
         """When it is time for one."""
         if self._is_virtual:
             share = moment.share or 0.0
@@ -283,9 +283,9 @@ class Foot:
         self._live = live
         self._clock = clock
         self._next_ns = 0
-        self._last: Moment | None = None
+        self._last: ShownMoment | None = None
 
-    def show(self, moment: Moment) -> None:
+    def show(self, moment: ShownMoment) -> None:
         """Four times a second at the most."""
         self._last = moment
         if (now_ns := self._clock.now_ns()) >= self._next_ns:
@@ -306,7 +306,7 @@ class Foot:
         self._live.console.print(Text(one_line(line), style=style), soft_wrap=True)
 
 
-View = Silent | Lines | Foot  # each shows moments as often as it likes, and every message at once
+View = Silent | PlainLines | Foot  # each shows moments as often as it likes, and every message at once
 
 
 @contextmanager

@@ -20,15 +20,15 @@ from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, DiskCalls, DiskProcess
 from thermostand.stand.config.checked import ATTACHMENT
 from thermostand.stand.estimating.run_estimate import Night, price_night, small_disk
-from thermostand.stand.queueing import queue
-from thermostand.stand.queueing.queue import Asked
-from thermostand.stand.queueing.queue_file import Entry, Queue, State, worked_on
-from thermostand.stand.queueing.queue_work import is_complete
 from thermostand.stand.running.course import Said
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import Order, attached_optics, check_plan, parse_order
 from thermostand.stand.running.resume import repaired
+from thermostand.stand.service import queue
+from thermostand.stand.service.queue import Asked
+from thermostand.stand.service.queue_file import Queue, QueueEntry, QueueState, worked_on
+from thermostand.stand.service.queue_work import is_complete
 from thermostand.stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended
@@ -73,7 +73,7 @@ class Orders:
         await self.disk.keep("worker", worked_on, self.directory)
         await self.read()
         first = next((entry for entry in self.queued.entries if entry.is_open), None)
-        if first is not None and first.state is State.INTERRUPTED:
+        if first is not None and first.state is QueueState.INTERRUPTED:
             reason = f"run {first.id} ({first.recipe}) was interrupted: {first.reason}; resume it, or take it out"
             await self.disk.call(queue.halt, self.directory, reason)
             await self.read()
@@ -83,7 +83,7 @@ class Orders:
         await self.disk.call(queue.clear, self.directory)
         await self.read()
 
-    async def submit(self, who: Who, request: RunRequest, key: str) -> Entry:
+    async def submit(self, who: Who, request: RunRequest, key: str) -> QueueEntry:
         """ConfigError for what is wrong with the request, Conflict for what is wrong with the stand."""
         order = await self.reading.call(self._order, request)
         said_of(who, request.note, request.tags)
@@ -94,7 +94,7 @@ class Orders:
         now_ns = self._open_stand.assembly.clock.now_ns()
         try:
             wanted = queue.entry_of(order, self._config_name, now_ns, asked)
-            entry: Entry = await self.disk.call(queue.append, self.directory, wanted)
+            entry: QueueEntry = await self.disk.call(queue.append, self.directory, wanted)
         except SessionError as error:
             raise Conflict(str(error)) from error
         self._expected_s[entry.id] = night.duration_s
@@ -105,7 +105,7 @@ class Orders:
         """Take it out; what it was halted for is over when it was that run."""
         entry = self._entry(number)
         await self._changed(queue.remove, number)
-        if entry.state is State.INTERRUPTED and not any(each.is_open for each in self.queued.entries):
+        if entry.state is QueueState.INTERRUPTED and not any(each.is_open for each in self.queued.entries):
             await self.clear()
 
     async def move(self, number: int, to: int) -> None:
@@ -113,7 +113,7 @@ class Orders:
         self._entry(number)
         await self._changed(queue.move, number, to)
 
-    async def resume(self, session: str) -> Entry:
+    async def resume(self, session: str) -> QueueEntry:
         """Its run is the next one."""
         folder = await self.reading.call(self.folder_of, session)
         try:
@@ -130,18 +130,18 @@ class Orders:
         order = await self.reading.call(self._recorded, session)
         now_ns = self._open_stand.assembly.clock.now_ns()
         wanted = queue.entry_of(order, self._config_name, now_ns)
-        entry: Entry = await self.disk.call(queue.put_first, self.directory, wanted, session)
+        entry: QueueEntry = await self.disk.call(queue.put_first, self.directory, wanted, session)
         await self.read()
         return entry
 
     def shown(self) -> tuple[QueuedRun, ...]:
         """The queue for clients: the last that have ended, the run under way, those to be done."""
-        ended = [entry for entry in self.queued.entries if not entry.is_open and entry.state is not State.RUNNING]
+        ended = [entry for entry in self.queued.entries if not entry.is_open and entry.state is not QueueState.RUNNING]
         first = ended[-_SHOWN:][:1]
         since = self.queued.entries.index(first[0]) if first else 0
         return tuple(self.shown_run(entry) for entry in self.queued.entries[since:])
 
-    def shown_run(self, entry: Entry) -> QueuedRun:
+    def shown_run(self, entry: QueueEntry) -> QueuedRun:
         """One of it."""
         same = entry.model_dump(mode="json", include=set(QueuedRun.model_fields))
         return QueuedRun(**same, expected_s=self._expected_s.get(entry.id))
@@ -153,7 +153,7 @@ class Orders:
             raise Conflict(str(error)) from error
         await self.read()
 
-    def _entry(self, number: int) -> Entry:
+    def _entry(self, number: int) -> QueueEntry:
         entry = next((entry for entry in self.queued.entries if entry.id == number), None)
         if entry is None:
             raise Missing(f"no run {number} is in the queue")
@@ -172,7 +172,7 @@ class Orders:
         order = replace(parse_order({**self._texts, "recipe.yaml": text}, names), attended=request.attended)
         return self._here(order)
 
-    def order_of(self, entry: Entry) -> Order:
+    def order_of(self, entry: QueueEntry) -> Order:
         """What it asks for, on the stand as it is open now; ConfigError as `queue.order_of`."""
         return self._here(replace(queue.order_of(entry), attended=entry.attended))
 

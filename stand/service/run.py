@@ -50,7 +50,6 @@ from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WIT
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.safe_ranges import accepted_text
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.queueing.host import Host
 from thermostand.stand.running.guest import Guest, Job, Work
 from thermostand.stand.running.opening.claim import claimed, latch_file
 from thermostand.stand.running.opening.clock_watch import ClockWatch
@@ -66,7 +65,8 @@ from thermostand.stand.running.session_files import (
     session_directory,
     tell_identities,
 )
-from thermostand.stand.service import StandService
+from thermostand.stand.service.host import Host
+from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.alerts import alerting
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve

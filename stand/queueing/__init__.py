@@ -1,1 +1,0 @@
-"""Runs one after the other, over nights and restarts."""
