@@ -32,6 +32,7 @@ app = App()
 @app.command()
 def device(
     name: Annotated[str, typer.Argument(help="The device; without one all are listed, with what they take.")] = "",
+    *,
     verb: Annotated[str, typer.Argument(help="What it is to do.")] = "",
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="What the verb takes.")

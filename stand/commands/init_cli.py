@@ -36,6 +36,7 @@ def init(
     directory: Annotated[
         Path, typer.Argument(metavar="DIR", help="The folder of the stand; made when it is not there.")
     ],
+    *,
     name: Annotated[str, typer.Option(help="Of the stand; else the folder's.")] = "",
     simulated: Annotated[bool, typer.Option("--simulated", help="The simulated stand: nothing is asked.")] = False,
     bus: Annotated[

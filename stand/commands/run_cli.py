@@ -67,6 +67,7 @@ def demo(
 @app.command()
 def run(
     recipe: RecipeArgument,
+    *,
     config: ConfigOption = "simulated",
     out: Annotated[Path | None, typer.Option(help="Where the session goes; else recording.directory.")] = None,
     virtual_time: Annotated[

@@ -100,6 +100,7 @@ app = App()
 @app.command()
 def serve(
     configuration: ConfigArgument = None,
+    *,
     by_option: ConfigOrOption = None,
     out: Annotated[Path | None, typer.Option(help="Where the sessions go; else recording.directory.")] = None,
     port: Annotated[

@@ -38,6 +38,7 @@ def service() -> None:
 @app.command()
 def install(
     configuration: ConfigArgument = None,
+    *,
     by_option: ConfigOrOption = None,
     user: Annotated[str, typer.Option(help="The user it runs as, who owns the sessions.")] = "",
     group: Annotated[str, typer.Option(help="The group of those who may operate the stand; else that user's.")] = "",

@@ -273,13 +273,13 @@ class Guest:
             hub,
             clock,
             log,
-            recorder.flushed,
-            settling,
-            offsets,
-            allowed,
-            recorder.lost_of,
-            Decider(recorder.directory, clock, DECIDES).decide,
-            open_stand.guard.meet,
+            flushed=recorder.flushed,
+            settling=settling,
+            offsets=offsets,
+            allowed=allowed,
+            lost=recorder.lost_of,
+            decider=Decider(recorder.directory, clock, DECIDES).decide,
+            meet=open_stand.guard.meet,
         )
         leaving.callback(executor.close)
         return executor
@@ -298,7 +298,10 @@ class Guest:
         def soaked_again_s() -> float | None:
             return supply.equilibrium.soaked_s() if supply.is_on else None
 
-        board = StatusBoard(name, night, kept, gate, self.stop, open_stand.latch, recorder, clock, soaked_again_s)
+        latch = open_stand.latch
+        board = StatusBoard(
+            name, night, kept, gate, self.stop, latch, recorder=recorder, clock=clock, soaked_again_s=soaked_again_s
+        )
         assembly.hub.subscribe(board)
         leaving.callback(assembly.hub.unsubscribe, board)
         if not isinstance(clock, VirtualClock):  # there nobody waits for the end

@@ -80,7 +80,7 @@ def recorder_of(
     """The recorder of this run; `disk` is the process that touches the disk for it."""
     windows = _partial_frames(order)
     attachments, hub, clock = order.attachments(), assembly.hub, assembly.clock
-    recorder = recorder_in(directory, info, attachments, order.config, hub, clock, disk, windows)
+    recorder = recorder_in(directory, info, attachments, order.config, hub, clock, disk=disk, windows=windows)
     if windows is not None:
         windows.tell = partial(recorder.tell, SEARCH_FAILED)
     return recorder
@@ -93,6 +93,7 @@ def recorder_in(
     config: StandConfig,
     hub: Hub,
     clock: Clock,
+    *,
     disk: DiskProcess | None = None,
     windows: MarkerWindows | None = None,
 ) -> Recorder:

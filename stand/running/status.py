@@ -78,6 +78,7 @@ class StatusBoard:
         gate: Gate,
         stop: Stop,
         latch: Latch,
+        *,
         recorder: Recorder,
         clock: Clock,
         soaked_again_s: Callable[[], float | None] = lambda: None,

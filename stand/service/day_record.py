@@ -103,7 +103,7 @@ class DayRecord:
         info = await self._lane.call(self._place, day)
         directory = self._out / info.session_id
         tap, disk = _Tap(self._assembly.hub), DiskProcess()
-        recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk)
+        recorder = recorder_in(directory, info, self._texts, self._assembly.config, tap, self._clock, disk=disk)
         try:
             await recorder.begin(tuple)
         except BaseException:

@@ -380,7 +380,7 @@ async def _run(job: Job, front: Front, clock: Clock, time: Time | None, stop: St
             async with alerts, _telling_failure(assembly, directory, stop):
                 async with opened(assembly, time, stop, is_for_one=True) as open_stand:
                     answer = partial(_answer, open_stand, directory, front)
-                    recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk, answer)
+                    recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk, answer=answer)
                 _check_outcome(directory, recorder, assembly)
         finally:
             assembly.notifier.close()
@@ -455,6 +455,7 @@ async def _stay(
     early: _Early,
     stop: Stop,
     disk: DiskProcess | None,
+    *,
     answer: Callable[[], Work] | None = None,
 ) -> Recorder:
     """From the camera's start to the end of the recording."""

@@ -112,7 +112,9 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
     host, gate = Host(), Gate()
     clock = host.clock()
     recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
-    board = StatusBoard("night", Night(()), RunState(()), gate, Stop(), Latch(gate, Hub(), clock), recorder, clock)
+    board = StatusBoard(
+        "night", Night(()), RunState(()), gate, Stop(), Latch(gate, Hub(), clock), recorder=recorder, clock=clock
+    )
     host.step(3600)
     board(Event(clock.now_ns(), "warning", "odd", "it is so"))
     host.step(-60)
@@ -132,9 +134,9 @@ def test_the_board_says_that_a_camera_soaks_again_and_for_how_long():
         gate,
         Stop(),
         Latch(gate, Hub(), clock),
-        recorder,
-        clock,
-        lambda: soaked.pop(0),
+        recorder=recorder,
+        clock=clock,
+        soaked_again_s=lambda: soaked.pop(0),
     )
     assert board.status().doing == "the camera was or may have been off and soaks again, for 12 min so far"
     assert board.status().doing == ""

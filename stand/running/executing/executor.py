@@ -135,6 +135,7 @@ class Executor:
         hub: Hub,
         clock: Clock,
         log: Logbook,
+        *,
         flushed: Callable[[], Awaitable[None]],
         settling: SettlingWatch,
         offsets: OffsetWatch,

@@ -61,7 +61,7 @@ async def serve(
             door.close()
         presence.disappear()
         raise
-    thread = _Thread(bridge, doors, presence, interface, access, stop, report)
+    thread = _Thread(bridge, doors, presence, interface, access, stop, report=report)
     try:
         for door in (*_UNIX, _TCP):
             if door in doors:
@@ -152,6 +152,7 @@ class _Thread:
         interface: Interface,
         access: Access,
         stop: StopThread,
+        *,
         report: Callable[[EventKind, str], None],
     ) -> None:
         self._bridge = bridge

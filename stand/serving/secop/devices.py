@@ -8,7 +8,7 @@ from pydantic import JsonValue
 
 from thermostand.stand.estimating.chamber_model import BAND_K
 from thermostand.stand.serving.commands import STOP
-from thermostand.stand.serving.commands import ModuleCommand as Ordered
+from thermostand.stand.serving.commands import Command as Ordered
 from thermostand.stand.serving.desk import DeviceState, ReadingState, RunStatus, StandState
 from thermostand.stand.serving.secop import datainfo
 from thermostand.stand.serving.secop.modules import (
