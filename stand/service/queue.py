@@ -38,7 +38,7 @@ def queued(directory: Path) -> Queue:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Who asked for a run, and how: see queue_file.Entry."""
+    """Who asked for a run, and how: see queue_file.QueueEntry."""
 
     key: str = ""
     request: str = ""

@@ -212,9 +212,16 @@ class Life:
         self.stand.gate.subscribe(self.log.held)
         stand = cast(Stand, self.stand)  # run_stand.py holds the one against the other
         settling = SettlingWatch(stand, self.hub, self.clock, TARGET)
-        watches = settling, OffsetWatch(self.hub, self.clock, self._gap)
         self.executor = Executor(
-            stand, self.hub, self.clock, self.log, self._flushed, *watches, decider=self._decider, meet=self._meet
+            stand,
+            self.hub,
+            self.clock,
+            self.log,
+            flushed=self._flushed,
+            settling=settling,
+            offsets=OffsetWatch(self.hub, self.clock, self._gap),
+            decider=self._decider,
+            meet=self._meet,
         )
         self._flap = asyncio.create_task(keep_shut_in_holds(stand, self.hub, self.clock))
         self.run = asyncio.create_task(self._run(self.executor))

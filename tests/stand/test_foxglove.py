@@ -60,7 +60,7 @@ async def data(viewer: ClientConnection) -> tuple[int, int, bytes]:
 
 async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot_write():
     port = free_port()
-    published = live.Published("a stand", port)
+    published = live.FoxgloveServer("a stand", port)
     pictures = [(NOW_NS, b"\xff\xd8 a picture")]
     asked: list[int] = []
 
@@ -117,4 +117,4 @@ def test_a_port_that_is_taken_is_said_to():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         with pytest.raises((OSError, RuntimeError)):
-            live.Published("a stand", taken.getsockname()[1])
+            live.FoxgloveServer("a stand", taken.getsockname()[1])

@@ -219,7 +219,7 @@ async def test_a_viewer_that_sends_is_disconnected_and_takes_no_stop_away(tmp_pa
 
 
 async def test_between_the_messages_of_a_replay_others_have_their_turn():
-    viewer, turns = streams.Viewer(streams.Message(seq, "event", "{}") for seq in range(100)), 0
+    viewer, turns = streams.Viewer(streams.StreamMessage(seq, "event", "{}") for seq in range(100)), 0
 
     async def take_turns() -> None:
         nonlocal turns
