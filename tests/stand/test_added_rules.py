@@ -15,9 +15,9 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading
 from thermostand.stand.assembly import assemble
+from thermostand.stand.commands.remedies import next_command, troubleshooting
 from thermostand.stand.config.stand_config import StandConfig, packaged
 from thermostand.stand.fault import Fault
-from thermostand.stand.commands.remedies import next_command, troubleshooting
 
 MODULE = """
 from pydantic import Field

@@ -18,14 +18,14 @@ from thermostand.foundation.patience import BUDGET_S, LEAST_S, Patience
 from thermostand.recording.writing.disk import FILES_LINE, QUEUE_LINE, DiskCalls, DiskProcess
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from thermostand.stand.chamber.compressor import CompressorFile, CompressorState
-from thermostand.stand.service.daemon_file import KeptCounters, KeptFile
-from thermostand.stand.service.queue import append
-from thermostand.stand.service.queue_file import QueueEntry
-from thermostand.stand.service.queue_work import RunNotes, drain
 from thermostand.stand.running.memory.entries import Begun, Ended
 from thermostand.stand.running.memory.journal import Journal, Logbook
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import STOPPED, Interrupted, Stop
+from thermostand.stand.service.daemon_file import KeptCounters, KeptFile
+from thermostand.stand.service.queue import append
+from thermostand.stand.service.queue_file import QueueEntry
+from thermostand.stand.service.queue_work import RunNotes, drain
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", stop_frames_below_bytes=0, alert_below_fraction=0.0)
