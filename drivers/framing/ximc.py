@@ -21,7 +21,7 @@ CRC_SIZE = 2
 ERROR_SIZES: dict[str, int] = {"errc": 0, "errd": 0, "errv": 0}
 
 
-class Damage(Enum):
+class XimcDamage(Enum):
     """Why a frame cannot be used."""
 
     NONE = auto()
@@ -30,13 +30,13 @@ class Damage(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
-    """One frame as received. With Damage.LETTERS its size is unknown and `payload` empty; with Damage.CRC `payload`
-    is what arrived. Letters that are no ASCII appear as Latin-1."""
+class XimcFrame:
+    """One frame as received. With XimcDamage.LETTERS its size is unknown and `payload` empty; with XimcDamage.CRC
+    `payload` is what arrived. Letters that are no ASCII appear as Latin-1."""
 
     letters: str
     payload: bytes = b""
-    damage: Damage = Damage.NONE
+    damage: XimcDamage = XimcDamage.NONE
 
 
 def _crc_of_byte(crc: int) -> int:
@@ -71,18 +71,18 @@ def encode(letters: str, payload: bytes = b"") -> bytes:
     return letters.encode("ascii") + payload + crc
 
 
-def decode(received: bytes, payload_sizes: Mapping[str, int]) -> tuple[Frame | None, bytes]:
+def decode(received: bytes, payload_sizes: Mapping[str, int]) -> tuple[XimcFrame | None, bytes]:
     """The first frame in `received` and the bytes after it; (None, bytes to keep) while it is incomplete.
 
     Zero bytes before the letters are resync filling and skipped. Letters not in `payload_sizes` give a frame with
-    Damage.LETTERS, and the bytes after it begin right behind the letters.
+    XimcDamage.LETTERS, and the bytes after it begin right behind the letters.
     """
     received = received.lstrip(b"\0")
     if len(received) < LETTERS_SIZE:
         return None, received
     letters = received[:LETTERS_SIZE].decode("latin-1")
     if letters not in payload_sizes:
-        return Frame(letters, damage=Damage.LETTERS), received[LETTERS_SIZE:]
+        return XimcFrame(letters, damage=XimcDamage.LETTERS), received[LETTERS_SIZE:]
     payload_size = payload_sizes[letters]
     end = frame_size(payload_size)
     if len(received) < end:
@@ -90,4 +90,4 @@ def decode(received: bytes, payload_sizes: Mapping[str, int]) -> tuple[Frame | N
     payload = received[LETTERS_SIZE : LETTERS_SIZE + payload_size]
     crc = received[LETTERS_SIZE + payload_size : end]
     intact = not payload_size or int.from_bytes(crc, "little") == crc16(payload)
-    return Frame(letters, payload, Damage.NONE if intact else Damage.CRC), received[end:]
+    return XimcFrame(letters, payload, XimcDamage.NONE if intact else XimcDamage.CRC), received[end:]

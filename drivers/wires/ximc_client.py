@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from thermostand.drivers.framing.ximc import ERROR_SIZES, Damage, Frame, decode, encode
+from thermostand.drivers.framing.ximc import ERROR_SIZES, XimcDamage, XimcFrame, decode, encode
 from thermostand.drivers.wires.link import ByteLink
 from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
@@ -76,7 +76,11 @@ class XimcClient:
                 self._resync(link)
             link.write((b"" if self._echoes is False else _MARK) + encode(letters, payload))
             frame, rest, is_marked = self._receive(link, letters, reply_size)
-            if frame is not None and (frame.letters, frame.damage) == (letters, Damage.NONE) and not rest.strip(b"\0"):
+            if (
+                frame is not None
+                and (frame.letters, frame.damage) == (letters, XimcDamage.NONE)
+                and not rest.strip(b"\0")
+            ):
                 if self._echoes is None:
                     self._echoes = is_marked
                 if is_marked or not self._echoes:
@@ -88,7 +92,7 @@ class XimcClient:
             raise
         raise self._complaint(letters, frame)
 
-    def _receive(self, link: ByteLink, letters: str, reply_size: int) -> tuple[Frame | None, bytes, bool]:
+    def _receive(self, link: ByteLink, letters: str, reply_size: int) -> tuple[XimcFrame | None, bytes, bool]:
         """The first frame, what came with it, and whether zeros came before it; no frame when none was complete in
         time."""
         deadline_s = time.monotonic() + self._timeout_s
@@ -112,7 +116,7 @@ class XimcClient:
                     return
         raise Unreachable(self._device, "the controller does not answer, nor does it echo zeros")
 
-    def _complaint(self, letters: str, frame: Frame | None) -> DeviceError:
+    def _complaint(self, letters: str, frame: XimcFrame | None) -> DeviceError:
         """What was wrong with the answer to `letters`."""
         if frame is None:
             return Unreachable(self._device, f"no answer to {letters} within {self._timeout_s:g} s")
@@ -122,7 +126,7 @@ class XimcClient:
             return Refused(self._device, f"a value in {letters} was out of range and the controller changed it")
         if frame.letters == "errd":
             return GarbledReply(self._device, f"the controller received {letters} damaged")
-        if frame.damage is Damage.NONE:
+        if frame.damage is XimcDamage.NONE:
             return GarbledReply(self._device, f"more came than the answer to {letters}, or an earlier answer")
         return GarbledReply(self._device, f"the answer to {letters} was {frame.letters!r} ({frame.damage.name})")
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.drivers.framing.ximc import ERROR_SIZES, Damage, Frame, crc16, decode, encode, frame_size
+from thermostand.drivers.framing.ximc import ERROR_SIZES, XimcDamage, XimcFrame, crc16, decode, encode, frame_size
 
 # letters, payload, bytes on the wire; the longer ones as libximc 3.1.1 sent them: it fills reserved bytes with 0xCC.
 CASES = [
@@ -30,7 +30,7 @@ SIZES = ERROR_SIZES | {letters: len(payload) for letters, payload, _ in CASES}
 LETTERS = st.text("abcdefghijklmnopqrstuvwxyz", min_size=4, max_size=4)
 
 
-def decode_in_pieces(wire: bytes, sizes: dict[str, int]) -> Frame | None:
+def decode_in_pieces(wire: bytes, sizes: dict[str, int]) -> XimcFrame | None:
     kept = b""
     for position in range(len(wire)):
         frame, kept = decode(kept + wire[position : position + 1], sizes)
@@ -48,7 +48,7 @@ def test_crc_has_the_check_value_of_crc_16_modbus() -> None:
 def test_a_frame_encodes_and_decodes_whole_in_pieces_and_with_trailing_bytes(
     letters: str, payload: bytes, wire: bytes
 ) -> None:
-    frame = Frame(letters, payload)
+    frame = XimcFrame(letters, payload)
     assert encode(letters, payload) == wire
     assert len(wire) == frame_size(len(payload))
     assert decode(wire, SIZES) == (frame, b"")
@@ -61,7 +61,7 @@ def test_a_frame_encodes_and_decodes_whole_in_pieces_and_with_trailing_bytes(
 @given(LETTERS, st.binary(max_size=210), st.integers(0, 70), st.binary(max_size=9))
 def test_any_frame_comes_back_as_it_went(letters: str, payload: bytes, zeros: int, after: bytes) -> None:
     wire = bytes(zeros) + encode(letters, payload) + after
-    assert decode(wire, {letters: len(payload)}) == (Frame(letters, payload), after)
+    assert decode(wire, {letters: len(payload)}) == (XimcFrame(letters, payload), after)
 
 
 @given(LETTERS, st.binary(min_size=1, max_size=60), st.data())
@@ -71,13 +71,13 @@ def test_one_flipped_bit_behind_the_letters_is_always_seen(letters: str, payload
     wire[bit // 8] ^= 1 << bit % 8
     frame, rest = decode(bytes(wire), {letters: len(payload)})
     assert frame is not None
-    assert frame.damage is Damage.CRC
+    assert frame.damage is XimcDamage.CRC
     assert rest == b""
 
 
 def test_unknown_letters_are_reported_and_the_rest_is_left() -> None:
-    assert decode(b"xyzwgets", SIZES) == (Frame("xyzw", damage=Damage.LETTERS), b"gets")
-    assert decode(b"\xff\xfe12gets", SIZES) == (Frame("\xff\xfe12", damage=Damage.LETTERS), b"gets")
+    assert decode(b"xyzwgets", SIZES) == (XimcFrame("xyzw", damage=XimcDamage.LETTERS), b"gets")
+    assert decode(b"\xff\xfe12gets", SIZES) == (XimcFrame("\xff\xfe12", damage=XimcDamage.LETTERS), b"gets")
 
 
 def test_an_incomplete_frame_is_kept_without_its_leading_zeros() -> None:

@@ -4,7 +4,7 @@ import struct
 from typing import Literal, NamedTuple
 
 from tests.still_plant import StillPlant
-from thermostand.drivers.framing.ximc import Damage, decode, encode
+from thermostand.drivers.framing.ximc import XimcDamage, decode, encode
 from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 from thermostand.foundation.clock import FollowedClock, seconds_ns
@@ -67,7 +67,7 @@ class Bench:
     def ask(self, letters: str, payload: bytes = b"", size: int = 4) -> bytes:
         frame, rest = decode(self.engine.feed(encode(letters, payload)), {letters: max(0, size - 6)})
         assert frame is not None
-        assert (frame.damage, rest) == (Damage.NONE, b"")
+        assert (frame.damage, rest) == (XimcDamage.NONE, b"")
         return frame.payload
 
     def status(self) -> Status:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
-from thermostand.drivers.framing.ximc import Damage, Frame, decode, encode
+from thermostand.drivers.framing.ximc import XimcDamage, XimcFrame, decode, encode
 from thermostand.drivers.sim.fakes import STAGES, Bench, fake
 from thermostand.drivers.sim.motion import ximc_table as table
 from thermostand.drivers.sim.motion.kinematics import Pace
@@ -217,13 +217,13 @@ class FakeAxis:
             steps = round(steps)
         return steps * self._profile.unit_per_step
 
-    def handle(self, frame: Frame) -> bytes:
+    def handle(self, frame: XimcFrame) -> bytes:
         """The reply to one request, whose effect begins at the clock's present time."""
         with self._plant.at(self._clock) as now_ns:
             self._settle(now_ns)
-            if frame.damage is Damage.CRC:
+            if frame.damage is XimcDamage.CRC:
                 return self._error("errd", table.FLAG_ERRD)
-            if frame.damage is Damage.LETTERS or frame.letters in table.SERVICE_SIZES:
+            if frame.damage is XimcDamage.LETTERS or frame.letters in table.SERVICE_SIZES:
                 return self._error("errc", table.FLAG_ERRC)
             if frame.letters in table.QUERIES:
                 return encode(frame.letters, self._answer(frame.letters, now_ns))
@@ -370,7 +370,7 @@ class FakeAxis:
         self._errors |= flag
         return encode(letters)
 
-    def _act(self, frame: Frame, now_ns: int) -> bytes:
+    def _act(self, frame: XimcFrame, now_ns: int) -> bytes:
         if frame.letters in MOTION:
             return self._move(frame, now_ns)
         match frame.letters:
@@ -396,7 +396,7 @@ class FakeAxis:
                 pass  # the sync-in queue, measurements, robust settings and stage memory change nothing here
         return encode(frame.letters)
 
-    def _move(self, frame: Frame, now_ns: int) -> bytes:
+    def _move(self, frame: XimcFrame, now_ns: int) -> bytes:
         """Begin a motion; in ALARM the request is acknowledged and ignored."""
         if self.alarm:
             return encode(frame.letters)
