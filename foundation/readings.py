@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,16 @@ class Quality(StrEnum):
 # Why one is STALE: "alarm", the device is in an alarm of its own; "doubt", it was measured, but its value is not to be
 # believed (jumped, noisy, stuck); "" otherwise.
 Cause = Literal["", "wire", "device", "alarm", "doubt"]
+
+
+class Channel(NamedTuple):
+    """What a device measures. name: the second part of its readings' channel (`air` of `thermometers.air`). unit: of
+    its readings, any, 1 for a flag or count, "" for what has none. kind: what it is of, in one word (temperature,
+    pressure, flag); a temperature in degC is looked at as those of the stand are."""
+
+    name: str
+    unit: str
+    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from thermostand.drivers.wires.registers import RegisterMap, load_register_map
 from thermostand.foundation.clock import Clock, VirtualClock
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
+from thermostand.recording.format.batches import RecordedDevice
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
 from thermostand.stand.config.stand_config import StandConfig, packaged
@@ -189,6 +190,15 @@ def _named(sensor: Sensor, config: StandConfig) -> str:
 def device_kinds(config: StandConfig) -> dict[str, str]:
     """What the stand is made of: name -> kind, but for what is in the place of a device and never read."""
     return {each.name: each.kind.name for each in config.equipment if each.poll_s is not None}
+
+
+def recorded_devices(config: StandConfig) -> dict[str, RecordedDevice]:
+    """What is recorded of each device that is read, by name; ConfigError when one declares what cannot be recorded."""
+    return {
+        each.name: RecordedDevice(each.kind.name, each.channels(partial(getattr, config), register_map))
+        for each in config.equipment
+        if each.poll_s is not None
+    }
 
 
 def register_map(key: str, unit: OnBus) -> RegisterMap:

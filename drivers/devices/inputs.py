@@ -16,7 +16,7 @@ from thermostand.drivers.wires.registers import RegisterMap
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, Unreachable
-from thermostand.foundation.readings import Reading
+from thermostand.foundation.readings import Channel, Reading
 
 
 class ContactSettings(Document):
@@ -107,6 +107,7 @@ KIND = DeviceKind(
     name="contacts",
     settings=InputsSettings,
     make=_make,
+    channels=lambda unit, of_section, map_of: (Channel(name, "1", "flag") for name in unit.contacts),
     section="inputs",
     device="inputs",
     rank=40,

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Coroutine, Iterable, Mapping
+import re
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -30,13 +31,16 @@ from thermostand.foundation.document_faults import path_text, words
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
 from thermostand.foundation.items import Item
-from thermostand.foundation.readings import Reading
+from thermostand.foundation.readings import Channel, Reading
 
+_CHANNEL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 GROUP = "thermostand.devices"
 ADDED = "devices"  # the section of a stand's file for the kinds of other packages
 Work = Coroutine[None, None, object]
 Arguments = Mapping[str, float]
 OfSection = Callable[[str], Any]  # what a section of the stand's file has
+MapOf = Callable[[str, OnBus], RegisterMap]  # of a unit, named in that section; ConfigError when missing or wrong
+Declared = Callable[[Any, OfSection, MapOf], Iterable[Channel]]  # of its settings; None for what is in its place
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,7 @@ class Around:
     publish: Callable[[Item], None]
     known: Callable[[str], Reading | None]
     of_section: OfSection
-    map_of: Callable[[str, OnBus], RegisterMap]
+    map_of: MapOf
 
 
 class LockedPlace(NamedTuple):
@@ -127,6 +131,13 @@ def _set_points(settings: object, of_section: OfSection) -> tuple[VerbNumber, ..
     return (VerbNumber("setpoint_degC", "degC", *of_section("limits").chamber_degC),)
 
 
+CONTROLLED = (
+    Channel("pv", "degC", "temperature"),
+    Channel("sp", "degC", "temperature"),
+    Channel("running", "1", "flag"),
+    Channel("fault", "1", "flag"),
+)
+"""What every controller of the chamber's temperature tells."""
 CONTROL = (
     Verb("set", "heat or cool to a set-point", lambda stand, _, given: stand.heat(given["setpoint_degC"]), _set_points),
     Verb("stop", "stop heating and cooling", lambda stand, name, given: stand.stop_heat()),
@@ -160,6 +171,7 @@ def _advise(error: DeviceError, name: str, settings: Any) -> str:
 class DeviceKind:
     """One row. name: as the device is shown. settings: its keys in the stand's file. make: the device, not opened.
 
+    channels: what it measures, or what says so of its settings, of other sections and of register maps.
     section: where the stand's file has it; device: its name, where there is only one. rank: the order in which devices
     are made, opened, polled and checked. is_opened: with the stand, else by what uses it. places: what is locked.
     address_key: the setting that says where it answers, "" for a unit on the bus. stand_in: what is in its place on a
@@ -173,6 +185,7 @@ class DeviceKind:
     name: str
     settings: type[Document]
     make: Callable[[str, Any, Around], Sensor]
+    channels: tuple[Channel, ...] | Declared = ()
     section: str = ADDED
     device: str = ""
     rank: int = 85
@@ -195,6 +208,13 @@ class DeviceKind:
         return of_protocol if of_protocol in fakes else next(iter(fakes), "")
 
 
+def _channel_fault(name: str, names: Sequence[str]) -> str:
+    """Why readings cannot be found by that name among these; "" when they can."""
+    if not _CHANNEL_NAME.fullmatch(name):
+        return "and a channel's name is of letters, digits and _, a letter first, at most 40; correct the package"
+    return "twice; a channel has one name and one unit: correct the package" if names.count(name) > 1 else ""
+
+
 class Equipment(NamedTuple):
     """One device of a stand; settings: None for what is in the place of one that it lacks."""
 
@@ -206,6 +226,16 @@ class Equipment(NamedTuple):
     def poll_s(self) -> float | None:
         """How often it is read; None for never."""
         return self.kind.stand_in_s if self.settings is None else self.settings.poll_s
+
+    def channels(self, of_section: OfSection, map_of: MapOf) -> tuple[Channel, ...]:
+        """What it measures; ConfigError when it declares what cannot be recorded under its name."""
+        declared = self.kind.channels
+        found = declared if isinstance(declared, tuple) else (*declared(self.settings, of_section, map_of),)
+        names = [each.name for each in found]
+        for each in found:
+            if fault := _channel_fault(each.name, names):
+                raise ConfigError(f"{self.name}: its kind {self.kind.name} declares the channel {each.name!r}, {fault}")
+        return found
 
     def made(self, around: Around) -> Sensor:
         """The device, or what is in its place; not opened."""

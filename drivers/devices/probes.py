@@ -26,7 +26,7 @@ from thermostand.foundation.addresses import ByteAddress
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock, call_pause_s
 from thermostand.foundation.errors import DeviceError, Refused, Unreachable
-from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.foundation.readings import Channel, Reading, bad_reading
 
 _GAP_S = 0.02
 _FAILED = re.compile(r"\*+")  # in the place of a number: not measured
@@ -34,22 +34,23 @@ _FAILED = re.compile(r"\*+")  # in the place of a number: not measured
 
 @dataclass(frozen=True, slots=True)
 class _Language:
-    """line: as delivered. read: the request; values: what its reply has, by channel with its unit."""
+    """line: as delivered. read: the request; values: what its reply has of each channel."""
 
     line: SerialSettings
     read: bytes
-    values: Mapping[str, tuple[str, re.Pattern[str]]]
+    values: Mapping[Channel, re.Pattern[str]]
     vendor: str
     model: str
     is_named: bool = False  # by *IDN?
 
 
 _NUMBER = r"\s*(-?\d+(?:\.\d+)?|\*+)\s*"
+_TEMPERATURE = Channel("temperature", "degC", "temperature")
 _LANGUAGES = {
     "hart": _Language(
         SerialSettings(2400, 1),
         b"T\r",
-        {"temperature": ("degC", re.compile(rf"^t:{_NUMBER}(\w)"))},
+        {_TEMPERATURE: re.compile(rf"^t:{_NUMBER}(\w)")},
         "Hart",
         "1502A",
         is_named=True,
@@ -58,8 +59,8 @@ _LANGUAGES = {
         SerialSettings(4800, 1, "E", 7),
         b"SEND\r",
         {
-            "temperature": ("degC", re.compile(rf"\bT={_NUMBER}'(\w)")),
-            "humidity": ("%", re.compile(rf"\bRH={_NUMBER}(%)RH")),
+            _TEMPERATURE: re.compile(rf"\bT={_NUMBER}'(\w)"),
+            Channel("humidity", "%", "humidity"): re.compile(rf"\bRH={_NUMBER}(%)RH"),
         },
         "Vaisala",
         "HMT330",
@@ -120,19 +121,19 @@ class Probe:
             values = await self._lane.call(self._values)
         now_ns, calibration = self._clock.now_ns(), self._settings.calibration
         readings: list[Reading] = []
-        for channel, (unit, _) in self._language.values.items():
-            name, value = f"{self.name}.{channel}", values[channel]
+        for channel, value in values.items():
+            name = f"{self.name}.{channel.name}"
             if math.isnan(value):
-                readings.append(bad_reading(name, unit, now_ns, "the instrument measures nothing"))
-            elif channel == "temperature":
+                readings.append(bad_reading(name, channel.unit, now_ns, "the instrument measures nothing"))
+            elif channel == _TEMPERATURE:
                 readings.append(calibration.reading(name, value, now_ns))
             else:
-                readings.append(Reading(name, value, unit, now_ns))
+                readings.append(Reading(name, value, channel.unit, now_ns))
         return tuple(readings)
 
     # Below: in the lane's thread.
 
-    def _values(self) -> dict[str, float]:
+    def _values(self) -> dict[Channel, float]:
         if not self._client.connected:
             self._identify()
         return self._client.query(self._language.read, self._heard)
@@ -149,18 +150,17 @@ class Probe:
             raise Refused(self.name, f"serial number {serial_number} answers, expected {wanted}")
         self.identity = same_device(self.name, Identity(vendor, model, serial_number, version), self.identity)
 
-    def _heard(self, data: bytes) -> dict[str, float] | None:
+    def _heard(self, data: bytes) -> dict[Channel, float] | None:
         """The values of the first line that has them all; None until such a line has ended."""
         for line in data.decode("latin-1").split("\n")[:-1]:
-            found = {channel: pattern.search(line) for channel, (_, pattern) in self._language.values.items()}
+            found = {channel: pattern.search(line) for channel, pattern in self._language.values.items()}
             if all(found.values()):
                 return {channel: self._value(channel, match) for channel, match in found.items() if match is not None}
         return None
 
-    def _value(self, channel: str, match: re.Match[str]) -> float:
-        unit, _ = self._language.values[channel]
-        if match[2] != _UNITS[unit]:
-            raise ValueError(f"{channel} is not in {unit}; set the instrument so")
+    def _value(self, channel: Channel, match: re.Match[str]) -> float:
+        if match[2] != _UNITS[channel.unit]:
+            raise ValueError(f"{channel.name} is not in {channel.unit}; set the instrument so")
         return math.nan if _FAILED.fullmatch(match[1]) else float(match[1])
 
 
@@ -184,6 +184,7 @@ KIND = DeviceKind(
     name="thermometers",
     settings=ProbeSettings,
     make=_make,
+    channels=lambda probe, of_section, map_of: _LANGUAGES[probe.protocol].values,
     section="probes",
     rank=50,
     advise=_advise,

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from thermostand.drivers.devices.checking import DeviceLook
-from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind
+from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, MapOf, OfSection
 from thermostand.drivers.settings import Identity, OnBus, PollPeriod_s
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
 from thermostand.drivers.wires.registers import Point, RegisterMap
 from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
-from thermostand.foundation.readings import Reading
+from thermostand.foundation.readings import Channel, Reading
 
 COIL_ON = 0xFF00
 COIL_OFF = 0x0000
@@ -224,10 +224,17 @@ async def _check(look: DeviceLook) -> None:
             look.warn(text, "switch it off at the board, or with `stand check --moves`")
 
 
+def _channels(settings: RelaysSettings | None, of_section: OfSection, map_of: MapOf) -> Iterator[Channel]:
+    """Each relay; without a board those that are remembered in its place."""
+    names = (HEATER_ENABLE, COMPRESSOR, CAMERA_POWER) if settings is None else settings.channels
+    return (Channel(str(name), "1", "flag") for name in names)
+
+
 KIND = DeviceKind(
     name="relays",
     settings=RelaysSettings,
     make=_make,
+    channels=_channels,
     section="relays",
     device="relays",
     rank=10,

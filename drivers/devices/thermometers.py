@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field
 
 from thermostand.drivers.devices.checking import DeviceLook, Finding
-from thermostand.drivers.devices.kinds import Around, DeviceKind
+from thermostand.drivers.devices.kinds import Around, DeviceKind, MapOf, OfSection
 from thermostand.drivers.devices.protocols import Sensor
 from thermostand.drivers.settings import Identity, Line, OnBus, Range
 from thermostand.drivers.wires.bus import Bus
@@ -19,7 +19,7 @@ from thermostand.drivers.wires.registers import RegisterMap
 from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
-from thermostand.foundation.readings import Quality, Reading, bad_reading
+from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
 
 PLAUSIBLE_DEGC = (-40.0, 100.0)
 
@@ -272,10 +272,18 @@ async def _check(look: DeviceLook) -> None:
         look.add(await _each_other(look.device, pv, look.of_section("guard").sensors.warn_K, look.clock))
 
 
+def _channels(settings: ThermometerModuleSettings, of_section: OfSection, map_of: MapOf) -> Iterator[Channel]:
+    """Of each sensor its temperature, and the module's word for it."""
+    for name in by_channel(of_section("thermometers")):
+        yield Channel(name, "degC", "temperature")
+        yield Channel(f"{name}_raw", "1", "count")
+
+
 KIND = DeviceKind(
     name="thermometers",
     settings=ThermometerModuleSettings,
     make=_make,
+    channels=_channels,
     section="thermometer_module",
     device="thermometers",
     rank=30,

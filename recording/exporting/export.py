@@ -5,7 +5,7 @@
     OUT/attachments/config.yaml ...  the attached files
     OUT/steps.csv, OUT/events.csv    and OUT/notes.csv, what people said of it
     OUT/frames.csv                   every frame with its role, set-point, temperatures and stages (or .parquet)
-    OUT/telemetry/chamber_state.csv  one table per topic (or .parquet), and camera_meta: the descriptions of all frames
+    OUT/telemetry/regulator.csv      one table per device (or .parquet), and camera_meta: the descriptions of all frames
     OUT/frames/000001.png, .txt      each frame in order of time, and its temperatures: "each captured frame also had
                                      the temperature information (as a separate file saved with the frame)"
                                      (Adamczyk et al., Sensors 2018, 18, 3685, section 2)
@@ -49,7 +49,7 @@ attachments/              configuration, recipe and target, as they were recorde
 steps.csv, events.csv     what was done, and what happened
 notes.csv                 what people said of it, if anybody did
 frames.csv (or .parquet)  every frame: its file, when, what for, set-point, temperatures, stages (columns below)
-telemetry/                one table for each topic; camera_meta describes every frame
+telemetry/                one table for each device; camera_meta describes every frame
 originals/                the pictures of the thermal imager, if there is one, as it stored them
 frames/000001.png, .txt   each frame in order of time, and the temperatures at its time; index.csv has all of these
 

@@ -14,10 +14,10 @@ from mcap_protobuf.schema import register_schema
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import make_durable_folder, sync_folder
-from thermostand.recording.exporting.topics import recorded_topics
+from thermostand.recording.exporting.topics import recorded_messages, recorded_topics
 from thermostand.recording.format.images import frame_topics
-from thermostand.recording.format.layout import DEVICES, SEQUENCE_MASK, SESSION_METADATA
-from thermostand.recording.format.records import RecordedMessage, telemetry_messages
+from thermostand.recording.format.layout import SEQUENCE_MASK, SESSION_METADATA
+from thermostand.recording.format.records import RecordedMessage
 from thermostand.recording.reading.notes import NOTES_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import frames_topic
@@ -85,22 +85,15 @@ def _write(
 
 
 def _channel(writer: Writer, topic: Topic) -> int:
-    devices = {DEVICES: ",".join(topic.devices)} if topic.devices else {}
-    return writer.register_channel(
-        topic.name, MessageEncoding.Protobuf, register_schema(writer, topic.message), devices
-    )
+    schema = register_schema(writer, topic.message)
+    return writer.register_channel(topic.name, MessageEncoding.Protobuf, schema, {**topic.metadata})
 
 
 def _messages(session: Session, frames: bool, telemetry: bool) -> Iterator[RecordedMessage]:
     """In order of time as far as each series is."""
-    of_telemetry = _telemetry(session) if telemetry else iter(())
+    of_telemetry = recorded_messages(session) if telemetry else iter(())
     of_frames = _frames(session) if frames else iter(())
     return heapq.merge(of_telemetry, of_frames, key=attrgetter("time_ns"))
-
-
-def _telemetry(session: Session) -> Iterator[RecordedMessage]:
-    for path in session.telemetry_segments:
-        yield from telemetry_messages(path, lambda channel: True)
 
 
 def _frames(session: Session) -> Iterator[RecordedMessage]:

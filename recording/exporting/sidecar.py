@@ -67,16 +67,16 @@ def sidecar_text(stand_columns: Sequence[Column], facts: Sequence[Cell]) -> str:
 class StandTemperatures:
     """The temperatures of the stand as they were last read at an instant, each with its age.
 
-    `columns` are a value and an age for each channel in degC, those of a kind's own names before others; NaN is a
+    `columns` are a value and an age for each channel in degC, those that their devices declare before others; NaN is a
     channel whose last reading was BAD, or that had not been read yet, which has no age.
     """
 
     def __init__(self, session: Session) -> None:
         warm = [channel for channel, unit in session.units().items() if unit == "degC"]
         usual = [
-            f"{device}.{quantity.name}"
-            for device, kind in recorded_devices(session).items()
-            for quantity in messages.KINDS[kind].quantities
+            f"{name}.{channel.name}"
+            for name, device in recorded_devices(session).items()
+            for channel in device.channels
         ]
         names = [*(name for name in usual if name in warm), *(name for name in warm if name not in usual)]
         self._readings = [session.readings(name) for name in names]

@@ -1,23 +1,23 @@
-"""The telemetry of a session as tables, one for each topic: a row an instant, a column a quantity.
-
-Devices have quantities beyond those of their kind, such as thermometers of a laboratory's own names: they have columns
-behind the others, named by the quantity and its unit.
+"""The telemetry of a session as tables, one for each device: a row an instant, a column a channel, named by what the
+device calls it and its unit. What a device was read to measure without having declared it has columns behind the
+others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from operator import attrgetter
 from pathlib import Path
 
 from thermostand.foundation.items import Batch
-from thermostand.foundation.readings import Reading
+from thermostand.foundation.readings import Channel, Reading
 from thermostand.recording.exporting.tables import TABLES, Cell, Column, TableFormat, TableWriter
 from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.format import messages
-from thermostand.recording.format.kinds import Quantity
-from thermostand.recording.format.records import RecordedMessage, telemetry_messages
+from thermostand.recording.format.batches import READINGS, fields_of
+from thermostand.recording.format.decoded_items import item_of
+from thermostand.recording.format.records import telemetry_messages
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.session import Session
 
@@ -34,30 +34,29 @@ META_COLUMNS = (
     Column("dropped", "count"),
     Column("flags", "word"),
 )
-_UNIT_WORDS = {"%": "percent", "1": ""}
-
-Quantities = Mapping[str, Sequence[Quantity]]  # by topic
 
 
 def write_telemetry(
     session: Session, folder: Path, table_format: TableFormat, done: Callable[[int, str], None]
 ) -> None:
-    """One table per topic, in the order of the recording, and one of the frames' descriptions. `done` gets the bytes of
-    each segment that has been read."""
+    """One table per device, in the order of the recording, and one of the frames' descriptions. `done` gets the bytes
+    of each segment that has been read."""
     folder.mkdir()
-    quantities = _quantities(session)
+    channels = _channels(session)
     tables: dict[str, TableWriter] = {}
     with ExitStack() as stack:
         for path in session.telemetry_segments:
-            for message in telemetry_messages(path, lambda channel: channel.topic in messages.KIND_OF_TOPIC):
-                if message.topic not in tables:
-                    name = message.topic.strip("/").replace("/", "_")
-                    columns = _columns(message.topic, quantities)
-                    table = TABLES[table_format](folder / f"{name}.{table_format}", columns)
-                    stack.callback(table.close)
-                    tables[message.topic] = table
-                for row in _rows(message, quantities, session.utc):
-                    tables[message.topic].add(row)
+            for message in telemetry_messages(path, lambda channel: channel.topic.startswith(READINGS)):
+                batch = item_of(message)
+                if not isinstance(batch, Batch):
+                    continue
+                name = batch.device
+                if name not in tables:
+                    columns = _columns(channels[name])
+                    tables[name] = TABLES[table_format](folder / f"{name}.{table_format}", columns)
+                    stack.callback(tables[name].close)
+                for row in _batch_rows(channels[name], batch, session.utc):
+                    tables[name].add(row)
             done(path.stat().st_size, f"telemetry {path.name}")
         if metas := session.frame_metas():
             described = TABLES[table_format](folder / f"camera_meta.{table_format}", META_COLUMNS)
@@ -82,55 +81,36 @@ def _described(meta: messages.FrameMeta, utc: UtcOffsets) -> Sequence[Cell]:
     )
 
 
-def _quantities(session: Session) -> Quantities:
-    """Those of each kind, then those that its devices in this session have besides."""
-    kinds = recorded_devices(session)
-    found = {topic: list(kind.quantities) for topic, kind in messages.KIND_OF_TOPIC.items()}
+def _channels(session: Session) -> dict[str, tuple[Channel, ...]]:
+    """What each device declares, then what it was read to measure besides."""
+    found = {name: device.channels for name, device in recorded_devices(session).items()}
     for channel, unit in session.units().items():
-        device, _, name = channel.partition(".")
-        if device not in kinds:
-            continue
-        own = found[messages.KINDS[kinds[device]].topic]
-        word = _UNIT_WORDS.get(unit, unit)
-        field = f"{name}_{word}" if word else name
-        is_there = any((each.name, each.unit) == (name, unit) for each in own)
-        if not is_there and not {field, f"{field}_quality"} & _taken(own):
-            own.append(Quantity(name, unit, field))
+        device, _, name = channel.removesuffix(f" ({unit})").partition(".")
+        if device in found and (name, unit) not in [(each.name, each.unit) for each in found[device]]:
+            found[device] = (*found[device], Channel(name, unit))
     return found
 
 
-def _taken(quantities: Sequence[Quantity]) -> set[str]:
-    """Names of columns that are in use."""
-    return {"time_ns", "time_utc", "device", "remarks"} | {
-        name for each in quantities for name in (each.field, f"{each.field}_quality")
-    }
-
-
-def _columns(topic: str, quantities: Quantities) -> tuple[Column, ...]:
+def _columns(channels: tuple[Channel, ...]) -> tuple[Column, ...]:
     """time_ns is the instant of the measurement; a value's unit is in its name."""
     values = [
         column
-        for quantity in quantities[topic]
-        for column in (Column(quantity.field, "value"), Column(f"{quantity.field}_quality", "word"))
+        for field in fields_of(channels)
+        for column in (Column(field, "value"), Column(f"{field}_quality", "word"))
     ]
-    return (*TIME_COLUMNS, Column("device", "word"), *values, Column("remarks", "text"))
+    return (*TIME_COLUMNS, *values, Column("remarks", "text"))
 
 
-def _rows(message: RecordedMessage, quantities: Quantities, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
-    batch = messages.decode_batch(message.topic, message.data, message.time_ns)
-    yield from _batch_rows(quantities[message.topic], batch, utc)
-
-
-def _batch_rows(quantities: Sequence[Quantity], batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
+def _batch_rows(channels: Sequence[Channel], batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
     """A row for each instant at which something was measured, most often one."""
-    keys = [(f"{batch.device}.{quantity.name}", quantity.unit) for quantity in quantities]
+    keys = [(f"{batch.device}.{each.name}", each.unit) for each in channels]
     for time_ns, readings in _by_instant(batch):
         cells: list[Cell] = []
         for key in keys:
             reading = readings.get(key)
             cells += (None, None) if reading is None else (reading.value, reading.quality.value)
         remarks = (_remark(reading, key in keys) for key, reading in readings.items())
-        yield (time_ns, utc.utc_ns(time_ns), batch.device, *cells, "; ".join(filter(None, remarks)))
+        yield (time_ns, utc.utc_ns(time_ns), *cells, "; ".join(filter(None, remarks)))
 
 
 def _by_instant(batch: Batch) -> Iterator[tuple[int, dict[tuple[str, str], Reading]]]:

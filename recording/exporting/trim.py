@@ -18,12 +18,12 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import TRIMMED
 from thermostand.foundation.files import new_folder
 from thermostand.foundation.items import StepMark, StepState
-from thermostand.recording.exporting.topics import recorded_topics
+from thermostand.recording.exporting.topics import recorded_messages, recorded_topics
 from thermostand.recording.format import messages
 from thermostand.recording.format.holes import holes_text
 from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
-from thermostand.recording.format.records import FramePlace, frame_places, read_frame, telemetry_messages
+from thermostand.recording.format.records import FramePlace, frame_places, read_frame
 from thermostand.recording.format.utc_offsets import offset_event
 from thermostand.recording.reading.run_word import Extent, extent_of
 from thermostand.recording.reading.session import Session
@@ -84,9 +84,8 @@ def _places(session: Session) -> Iterator[FramePlace]:
 
 
 def _telemetry(session: Session) -> Iterator[MessageRecord]:
-    for path in session.telemetry_segments:
-        for message in telemetry_messages(path, lambda channel: True):
-            yield MessageRecord(message.topic, message.time_ns, message.data, message.sequence)
+    for message in recorded_messages(session):
+        yield MessageRecord(message.topic, message.time_ns, message.data, message.sequence)
 
 
 def _kept(session: Session, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:

@@ -11,6 +11,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, Original, StepMark
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
+from thermostand.recording.format.batches import READINGS
 from thermostand.recording.format.damage import naming
 from thermostand.recording.format.images import decode_image, windows_of
 from thermostand.recording.format.records import FramePlace, RecordedMessage, read_frame
@@ -51,20 +52,20 @@ def event_of(message: RecordedMessage) -> Event:
 
 def stands_for_item(channel: Channel) -> bool:
     """Whether each message of a channel is an item; not so the log and the table's pose, which the recorder derives."""
-    return channel.topic in {*messages.KIND_OF_TOPIC, messages.STEP, messages.EVENT, messages.ORIGINAL}
+    return channel.topic.startswith(READINGS) or channel.topic in (messages.STEP, messages.EVENT, messages.ORIGINAL)
 
 
 def item_of(message: RecordedMessage) -> Batch | StepMark | Event | Original:
     """The item that a message stands for."""
+    if message.form is not None:
+        return message.form.decode(message.data, message.time_ns)
     match message.topic:
         case messages.STEP:
             return step_of(message)
         case messages.EVENT:
             return event_of(message)
-        case messages.ORIGINAL:
+        case _:
             return messages.decode_original(message.data, message.time_ns)
-        case topic:
-            return messages.decode_batch(topic, message.data, message.time_ns)
 
 
 def frame_of(recorded: RecordedImage) -> Frame:

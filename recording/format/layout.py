@@ -15,7 +15,6 @@ SESSION_METADATA = "session"
 SEGMENT_METADATA = "segment"
 SALVAGE_METADATA = "salvage"  # of a segment that a salvage has made
 FRAME_TABLE = "frames"  # attachment behind the frames of a segment: the descriptions of all of them
-DEVICES = "devices"  # key of a channel's metadata: the names of the devices on its topic, with commas between
 SEQUENCE_MASK = 0xFFFF_FFFF  # MCAP has 32 bits for the block id; a frame's description has all 64
 SESSION_CRC = "session_crc32"
 # Of the files, in the record `session`. From 0.2.0 on formats are kept: each version of the program reads those of all

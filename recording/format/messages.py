@@ -1,13 +1,9 @@
 """What a session holds, message by message: items of the hub to protobuf and back, and what belongs to a frame.
 
 Own messages are in package `thermostand`, one file each, made here at run time (no protoc); where Foxglove has a
-schema its name is used. Every batch message has one double per quantity, its unit in the field's name, and a quality
-beside it; a quantity the device did not give is NaN and ABSENT, so that no viewer draws it as 0. `remarks` repeats
-in full each reading the fixed fields cannot carry: it has a reason, an instant of its own, or no field. Images are in
-recording/format/images.py; batches are encoded where they are written, in recording/writing/telemetry.py.
+schema its name is used. Readings are in recording/format/batches.py, images in recording/format/images.py.
 
-Field numbers follow the order of the tables here and of recording/format/kinds.py. They are the file format: append,
-never reorder.
+Field numbers follow the order of the tables here. They are the file format: append, never reorder.
 """
 
 from __future__ import annotations
@@ -35,9 +31,8 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.items import Batch, Event, Original, StepMark, StepState
+from thermostand.foundation.items import Event, Original, StepMark, StepState
 from thermostand.foundation.readings import Cause, Quality, Reading
-from thermostand.recording.format.kinds import KIND_OF_TOPIC, KINDS, Kind
 
 TABLE_POSE = "/table/pose"
 STEP = "/experiment/step"
@@ -61,7 +56,7 @@ ABSENT = 0
 _pool = descriptor_pool.Default()
 
 
-def _field(
+def field(
     name: str, number: int, kind: FieldDescriptorProto.Type.ValueType, type_name: str = ""
 ) -> FieldDescriptorProto:
     """One singular field; `type_name` for an enum or a message."""
@@ -69,49 +64,48 @@ def _field(
     return FieldDescriptorProto(name=name, number=number, type=kind, label=label, type_name=type_name or None)
 
 
-def _message_class(name: str, fields: list[FieldDescriptorProto], needs_reading: bool = False) -> type[Message]:
-    """The class of `thermostand.<name>` with these fields."""
+def repeated(name: str, number: int, type_name: str) -> FieldDescriptorProto:
+    """Any number of messages."""
+    found = field(name, number, MESSAGE, type_name)
+    found.label = FieldDescriptorProto.LABEL_REPEATED
+    return found
+
+
+def _class_of(name: str, fields: list[FieldDescriptorProto], *needs: str) -> type[Message]:
+    """The class of `thermostand.<name>` with these fields, of messages of our own files that it needs."""
     file = FileDescriptorProto(name=f"thermostand/{name}.proto", package="thermostand", syntax="proto3")
     file.message_type.add(name=name, field=fields)
-    if name == "Reading":
-        quality = file.enum_type.add(name="Quality")
-        for text, number in (("ABSENT", ABSENT), *((q.name, n) for q, n in QUALITY_NUMBER.items())):
-            quality.value.add(name=text, number=number)
-    if needs_reading:
-        file.dependency.append("thermostand/Reading.proto")
+    file.dependency.extend(f"thermostand/{each}.proto" for each in needs)
     _pool.Add(file)
     return GetMessageClass(_pool.FindMessageTypeByName(f"thermostand.{name}"))
 
 
 def _plain_class(name: str, fields: Mapping[str, FieldDescriptorProto.Type.ValueType]) -> type[Message]:
     """A message of scalar fields, numbered from 1 in order."""
-    return _message_class(name, [_field(field, number, kind) for number, (field, kind) in enumerate(fields.items(), 1)])
+    return _class_of(name, [field(each, number, kind) for number, (each, kind) in enumerate(fields.items(), 1)])
 
 
-def _batch_class(kind: Kind) -> type[Message]:
-    """The message of a kind: device 1, remarks 2, time_ns 3 (of the readings; 0 when it is the log time), then value
-    and quality of each quantity."""
-    remarks = _field("remarks", 2, MESSAGE, ".thermostand.Reading")
-    remarks.label = FieldDescriptorProto.LABEL_REPEATED
-    fields = [_field("device", 1, STRING), remarks, _field("time_ns", 3, INSTANT)]
-    for index, quantity in enumerate(kind.quantities):
-        fields.append(_field(quantity.field, 4 + 2 * index, DOUBLE))
-        fields.append(_field(f"{quantity.field}_quality", 5 + 2 * index, ENUM, ".thermostand.Quality"))
-    return _message_class(kind.schema, fields, needs_reading=True)
+def _reading_file() -> FileDescriptorProto:
+    """A reading in full, and its quality."""
+    file = FileDescriptorProto(name="thermostand/Reading.proto", package="thermostand", syntax="proto3")
+    fields = [
+        field("channel", 1, STRING),
+        field("value", 2, FieldDescriptorProto.TYPE_DOUBLE),
+        field("unit", 3, STRING),
+        field("time_ns", 4, INSTANT),
+        field("quality", 5, FieldDescriptorProto.TYPE_ENUM, ".thermostand.Quality"),
+        field("reason", 6, STRING),
+        field("cause", 7, STRING),
+    ]
+    file.message_type.add(name="Reading", field=fields)
+    quality = file.enum_type.add(name="Quality")
+    for text, number in (("ABSENT", ABSENT), *((q.name, n) for q, n in QUALITY_NUMBER.items())):
+        quality.value.add(name=text, number=number)
+    return file
 
 
-REMARK_CLASS = _message_class(
-    "Reading",
-    [
-        _field("channel", 1, STRING),
-        _field("value", 2, DOUBLE),
-        _field("unit", 3, STRING),
-        _field("time_ns", 4, INSTANT),
-        _field("quality", 5, ENUM, ".thermostand.Quality"),
-        _field("reason", 6, STRING),
-        _field("cause", 7, STRING),
-    ],
-)
+READING_FILE = _reading_file()
+_pool.Add(READING_FILE)
 _FRAME_META: Mapping[str, FieldDescriptorProto.Type.ValueType] = {
     "channel": STRING,
     "time_ns": INSTANT,  # middle of the exposure
@@ -133,36 +127,23 @@ _FRAME_META: Mapping[str, FieldDescriptorProto.Type.ValueType] = {
 }
 
 
-def _frame_meta_class() -> type[Message]:
-    """The description of a frame, and with it the last reading of each temperature and position of the stand."""
-    readings = _field("readings", len(_FRAME_META) + 1, MESSAGE, ".thermostand.Reading")
-    readings.label = FieldDescriptorProto.LABEL_REPEATED
-    fields = [_field(name, number, kind) for number, (name, kind) in enumerate(_FRAME_META.items(), 1)]
-    return _message_class("FrameMeta", [*fields, readings], needs_reading=True)
-
-
-FRAME_META_CLASS = _frame_meta_class()
-
-
-def _frame_table_class() -> type[Message]:
-    file = FileDescriptorProto(name="thermostand/FrameTable.proto", package="thermostand", syntax="proto3")
-    file.dependency.append("thermostand/FrameMeta.proto")
-    frames = _field("frames", 1, MESSAGE, ".thermostand.FrameMeta")
-    frames.label = FieldDescriptorProto.LABEL_REPEATED
-    file.message_type.add(name="FrameTable", field=[frames])
-    _pool.Add(file)
-    return GetMessageClass(_pool.FindMessageTypeByName("thermostand.FrameTable"))
-
-
-_FrameTable = _frame_table_class()
+# The description of a frame, and with it the last reading of each temperature and position of the stand.
+FRAME_META_CLASS = _class_of(
+    "FrameMeta",
+    [
+        *(field(name, number, kind) for number, (name, kind) in enumerate(_FRAME_META.items(), 1)),
+        repeated("readings", len(_FRAME_META) + 1, ".thermostand.Reading"),
+    ],
+    "Reading",
+)
+_FrameTable = _class_of("FrameTable", [repeated("frames", 1, ".thermostand.FrameMeta")], "FrameMeta")
 _Step = _plain_class(
     "Step", {"step_id": STRING, "index": INT32, "kind": STRING, "state": STRING, "parameters_json": STRING}
 )
 _Event = _plain_class("Event", {"level": STRING, "kind": STRING, "text": STRING, "data_json": STRING})
 
-# Topic of the telemetry series -> message class.
+# Topic of the telemetry series, but for the readings of devices -> message class.
 CLASSES: Mapping[str, type[Message]] = {
-    **{kind.topic: _batch_class(kind) for kind in KINDS.values()},
     TABLE_POSE: PoseInFrame,
     STEP: _Step,
     EVENT: _Event,
@@ -179,34 +160,16 @@ def canonical(value: float) -> float:
     return math.nan if value != value else value
 
 
-def decode_batch(topic: str, data: bytes, log_time_ns: int) -> Batch:
-    """The batch of a message; SessionError when it is not one.
-
-    Its readings are in order of the kind's quantities, behind them the remarks in the order they were published.
-    Encoding it again gives the same bytes: the order between the two sorts is all that a message does not keep.
-    """
-    message = _parse(topic, data)
-    device: str = _get(message, "device")
-    time_ns: int = _get(message, "time_ns") or log_time_ns
-    remarks = [_remarked(remark) for remark in _get(message, "remarks")]
-    remarked = {(reading.channel, reading.unit) for reading in remarks}
-    readings: list[Reading] = []
-    for quantity in KIND_OF_TOPIC[topic].quantities:
-        quality: int = _get(message, f"{quantity.field}_quality")
-        channel = f"{device}.{quantity.name}"
-        if quality != ABSENT and (channel, quantity.unit) not in remarked:
-            readings.append(_reading(channel, _get(message, quantity.field), quantity.unit, time_ns, quality, ""))
-    return Batch(device, log_time_ns, (*readings, *remarks))
-
-
-def _remarked(remark: Any) -> Reading:
+def remarked(remark: Any) -> Reading:
+    """The inverse of remark_of; SessionError when it is none."""
     cause = CAUSES.get(remark.cause, "")
-    return _reading(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason, cause)
+    return reading_of(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason, cause)
 
 
-def _reading(
-    channel: str, value: float, unit: str, time_ns: int, quality: int, reason: str, cause: Cause = ""
+def reading_of(
+    channel: str, value: float, unit: str, time_ns: int, quality: int, reason: str = "", cause: Cause = ""
 ) -> Reading:
+    """A recorded reading; SessionError when its value does not fit its quality."""
     try:
         return Reading(channel, value, unit, time_ns, QUALITY_OF_NUMBER[quality], reason, cause)
     except (KeyError, ValueError) as error:
@@ -290,17 +253,17 @@ def varint(number: int) -> bytes:
     return bytes(encoded)
 
 
-def remark_of(reading: Reading) -> Message:
-    """A reading in full."""
-    return REMARK_CLASS(
-        channel=reading.channel,
-        value=canonical(reading.value),
-        unit=reading.unit,
-        time_ns=reading.time_ns,
-        quality=QUALITY_NUMBER[reading.quality],
-        reason=reading.reason,
-        cause=reading.cause,
-    )
+def remark_of(reading: Reading) -> dict[str, object]:
+    """A reading in full, as the fields of a message."""
+    return {
+        "channel": reading.channel,
+        "value": canonical(reading.value),
+        "unit": reading.unit,
+        "time_ns": reading.time_ns,
+        "quality": QUALITY_NUMBER[reading.quality],
+        "reason": reading.reason,
+        "cause": reading.cause,
+    }
 
 
 def encode_step(mark: StepMark) -> bytes:

@@ -20,6 +20,7 @@ from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from thermostand.foundation.errors import SessionError
+from thermostand.recording.format.batches import READINGS, BatchForm, form_of
 from thermostand.recording.format.damage import FileDamaged, naming, reading
 from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA
 from thermostand.recording.format.layout import (
@@ -45,7 +46,7 @@ from thermostand.recording.format.messages import CLASSES, FrameMeta, decode_fra
 from thermostand.recording.format.summary import ChunkPlace, Summary, read_summary
 
 _CHUNK_HEAD_BYTES = 64
-SCHEMAS = {topic: {message.DESCRIPTOR.full_name} for topic, message in CLASSES.items()}
+SCHEMAS = {topic: message.DESCRIPTOR.full_name for topic, message in CLASSES.items()}
 
 _MESSAGE_START = struct.Struct("<BQH")  # opcode, length, channel id
 _MESSAGE_REST = struct.Struct("<Iqq")  # sequence, log time, publish time; signed, as every instant of ours
@@ -56,12 +57,13 @@ _MESSAGE_BYTES = _MESSAGE_START.size + _MESSAGE_REST.size  # with the record's h
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
-    """One message as it is in the file; `data` is still encoded."""
+    """One message as it is in the file; `data` is still encoded. form: of the readings of a device."""
 
     topic: str
     sequence: int
     time_ns: int
     data: bytes
+    form: BatchForm | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +166,11 @@ def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterato
     """The messages of the wanted channels of a telemetry segment, in the order of the file."""
     with reading(path), path.open("rb") as file:
         summary = _open(path, file)
-        topics = {number: channel.topic for number, (channel, _) in _channels(summary).items() if wanted(channel)}
+        topics = {
+            number: (channel.topic, recorded_form(channel))
+            for number, (channel, _) in _channels(summary).items()
+            if wanted(channel)
+        }
         counts = dict.fromkeys(topics, 0)
         for place in summary.chunks():
             if topics.keys().isdisjoint(place.channels):
@@ -172,7 +178,7 @@ def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterato
             chunk = _chunk(file, place)
             for number, offset, end in _message_places(chunk, topics):
                 counts[number] += 1
-                yield _message(topics[number], chunk, offset, end)
+                yield _message(*topics[number], chunk, offset, end)
         if counts != {number: summary.statistics.channel_message_counts.get(number, 0) for number in topics}:
             raise ValueError("it does not hold the messages that its index lists")
 
@@ -181,10 +187,17 @@ def _channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
     """Channel id -> channel and schema; ValueError when a topic of ours holds messages that are not."""
     channels = summary.channels()
     for channel, schema in channels.values():
-        known = SCHEMAS.get(channel.topic)
-        if known is not None and schema not in known:
-            raise ValueError(f"{channel.topic} holds {schema}, not {' or '.join(sorted(known))}")
+        form = recorded_form(channel)
+        known = SCHEMAS.get(channel.topic) if form is None else form.message.DESCRIPTOR.full_name
+        if known is not None and schema != known:
+            raise ValueError(f"{channel.topic} holds {schema}, not {known}")
     return channels
+
+
+def recorded_form(channel: Channel) -> BatchForm | None:
+    """How the readings of a device are recorded on a channel, None when it has no readings; ValueError when it does not
+    say it."""
+    return form_of(channel.metadata) if channel.topic.startswith(READINGS) else None
 
 
 def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
@@ -233,9 +246,9 @@ def _message_places(chunk: memoryview, wanted: Container[int]) -> list[tuple[int
     return found
 
 
-def _message(topic: str, chunk: memoryview, offset: int, end: int) -> RecordedMessage:
+def _message(topic: str, form: BatchForm | None, chunk: memoryview, offset: int, end: int) -> RecordedMessage:
     sequence, time_ns, _ = _MESSAGE_REST.unpack_from(chunk, offset + _MESSAGE_START.size)
-    return RecordedMessage(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]))
+    return RecordedMessage(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]), form)
 
 
 def frame_places(path: Path) -> list[FramePlace]:

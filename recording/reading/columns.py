@@ -1,4 +1,4 @@
-"""Readings of a whole topic as columns, without an object for each reading.
+"""Readings as columns, without an object for each reading.
 
 Most messages have no remarks, and then their fields are all there is: they are gathered in rows of values and of
 qualities and checked together. The few others are decoded as batches.
@@ -7,7 +7,7 @@ qualities and checked together. The few others are decoded as batches.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any
@@ -18,103 +18,122 @@ from numpy.typing import NDArray
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch
-from thermostand.foundation.readings import Quality
 from thermostand.recording.format import messages
+from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchForm
+from thermostand.recording.format.records import RecordedMessage
 
 Column = tuple[NDArray[np.int64], NDArray[np.float64]]
-
-BAD = messages.QUALITY_NUMBER[Quality.BAD]
-KNOWN = list(messages.QUALITY_OF_NUMBER)
 
 Part = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]  # numbers of the messages, times, values
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Rows:
-    """The plain messages of one device: of each its number, its time, its values and their qualities."""
+    """The plain messages of one form: of each its number, its time, its values and their qualities."""
 
+    form: BatchForm
+    values_of: Callable[[Any], Iterable[float]] = field(init=False)
+    qualities_of: Callable[[Any], Iterable[int]] = field(init=False)
     numbers: array[int] = field(default_factory=lambda: array("q"))
     times_ns: array[int] = field(default_factory=lambda: array("q"))
     values: array[float] = field(default_factory=lambda: array("d"))
     qualities: array[int] = field(default_factory=lambda: array("i"))
 
+    def __post_init__(self) -> None:
+        names = (
+            *self.form.fields,
+            *self.form.fields[:1],
+        )  # of a single name attrgetter makes no tuple
+        if names:
+            self.values_of = attrgetter(*names)
+            self.qualities_of = attrgetter(*(f"{name}_quality" for name in names))
 
-class TopicColumns:
-    """The readings of one topic: `add` each message in the order of the files, then ask for the columns."""
 
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
-        self._quantities = messages.KIND_OF_TOPIC[topic].quantities
-        self._parse = messages.CLASSES[topic].FromString
-        names = [quantity.field for quantity in self._quantities]
-        names += names[:1]  # twice the first: of a single name attrgetter makes no tuple
-        self._values_of = attrgetter(*names)
-        self._qualities_of = attrgetter(*(f"{name}_quality" for name in names))
-        self._rows: dict[str, _Rows] = {}  # by device
+class ReadingColumns:
+    """The readings of a session: `add` each message in the order of the files, then ask for the columns.
+
+    A channel whose unit has changed, when a run was resumed with a device that declares another one, is two: the second
+    has its unit in its name.
+    """
+
+    def __init__(self) -> None:
+        self._rows: dict[BatchForm, _Rows] = {}
         self._single: dict[
             tuple[str, str], list[tuple[int, int, float]]
         ] = {}  # (device, channel) -> number, time, value
         self.doubted: dict[str, list[int]] = {}  # by channel: the instants, ns, of readings with cause "doubt"
-        self.units: dict[str, str] = {}  # by channel, as it was recorded first
+        self.units: dict[str, str] = {}  # by channel
         self._count = 0
 
-    def add(self, data: bytes, log_time_ns: int) -> None:
-        """One more message; SessionError when it is not one of this topic."""
+    def add(self, message: RecordedMessage) -> None:
+        """One more message of readings; SessionError when it is not one of its form."""
         self._count += 1
-        try:
-            message: Any = self._parse(data)
-        except DecodeError:
-            message = None
-        if message is None or message.remarks:
-            self._add_singly(messages.decode_batch(self._topic, data, log_time_ns))
-            return
-        rows = self._rows.get(message.device)
+        form = message.form
+        if form is None:
+            raise SessionError(f"{message.topic} has no readings")
+        rows = self._rows.get(form)
         if rows is None:
-            rows = self._rows[message.device] = _Rows()
+            rows = self._rows[form] = _Rows(form)
+            for each in form.device.channels:
+                self._named(f"{form.name}.{each.name}", each.unit)
+        try:
+            found: Any = form.message.FromString(message.data)
+        except DecodeError:
+            found = None
+        if found is None or found.remarks:
+            self._add_singly(form.decode(message.data, message.time_ns))
+            return
         rows.numbers.append(self._count)
-        rows.times_ns.append(message.time_ns or log_time_ns)
-        rows.values.extend(self._values_of(message))
-        rows.qualities.extend(self._qualities_of(message))
+        rows.times_ns.append(found.time_ns or message.time_ns)
+        if form.fields:
+            rows.values.extend(rows.values_of(found))
+            rows.qualities.extend(rows.qualities_of(found))
+
+    def _named(self, channel: str, unit: str) -> str:
+        """What a channel is called that is read in this unit."""
+        if self.units.setdefault(channel, unit) == unit:
+            return channel
+        self.units[f"{channel} ({unit})"] = unit
+        return f"{channel} ({unit})"
 
     def _add_singly(self, batch: Batch) -> None:
         for reading in batch.readings:
-            self.units.setdefault(reading.channel, reading.unit)
+            channel = self._named(reading.channel, reading.unit)
             if reading.cause == "doubt":
-                self.doubted.setdefault(reading.channel, []).append(reading.time_ns)
-            single = self._single.setdefault((batch.device, reading.channel), [])
+                self.doubted.setdefault(channel, []).append(reading.time_ns)
+            single = self._single.setdefault((batch.device, channel), [])
             single.append((self._count, reading.time_ns, reading.value))
 
     def columns(self) -> dict[str, dict[str, Column]]:
         """Device -> channel -> (time_ns, value) in order of time, of equal times in order of the files; SessionError
         when a value does not fit its quality."""
         parts: dict[tuple[str, str], list[Part]] = {}
-        for device, rows in self._rows.items():
-            for channel, part in self._parts(device, rows):
-                parts.setdefault((device, channel), []).append(part)
+        for form, rows in self._rows.items():
+            for channel, part in self._parts(form, rows):
+                parts.setdefault((form.name, channel), []).append(part)
         for key, single in self._single.items():
             numbers, times_ns, values = zip(*single, strict=True)
             part = (np.array(numbers, np.int64), np.array(times_ns, np.int64), np.array(values, np.float64))
             parts.setdefault(key, []).append(part)
-        columns: dict[str, dict[str, Column]] = {device: {} for device in self._rows}
+        columns: dict[str, dict[str, Column]] = {form.name: {} for form in self._rows}
         for (device, channel), of_channel in parts.items():
             columns.setdefault(device, {})[channel] = _sorted(of_channel)
         return columns
 
-    def _parts(self, device: str, rows: _Rows) -> Iterator[tuple[str, Part]]:
+    def _parts(self, form: BatchForm, rows: _Rows) -> Iterator[tuple[str, Part]]:
         """Each channel of a device with its readings in the plain messages."""
         numbers, times_ns = np.array(rows.numbers), np.array(rows.times_ns)
-        all_values = np.array(rows.values).reshape(len(numbers), -1)
-        all_qualities = np.array(rows.qualities).reshape(len(numbers), -1)
-        for index, quantity in enumerate(self._quantities):
+        shape = (len(numbers), len(form.fields) + 1 if form.fields else 0)
+        all_values, all_qualities = np.array(rows.values).reshape(shape), np.array(rows.qualities).reshape(shape)
+        for index, each in enumerate(form.device.channels):
             is_given = all_qualities[:, index] != messages.ABSENT
             values, qualities = all_values[is_given, index], all_qualities[is_given, index]
-            channel = f"{device}.{quantity.name}"
-            is_wrong = (np.isnan(values) != (qualities == BAD)) | ~np.isin(qualities, KNOWN)
+            channel = self._named(f"{form.name}.{each.name}", each.unit)
+            is_wrong = (np.isnan(values) != (qualities == BAD)) | ~np.isin(qualities, KNOWN_QUALITIES)
             if is_wrong.any():
                 value, quality = values[is_wrong][0], qualities[is_wrong][0]
                 raise SessionError(f"{channel}: the recorded value {value} does not fit its quality {quality}")
             if len(values):
-                self.units[channel] = quantity.unit
                 yield channel, (numbers[is_given], times_ns[is_given], values)
 
 

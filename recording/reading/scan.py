@@ -143,16 +143,17 @@ class Recorded:
 
     def receive(self, message: RecordedMessage) -> None:
         """Keep what a message of the telemetry says; SessionError when it cannot be read."""
+        if message.form is not None:
+            for reading in message.form.decode(message.data, message.time_ns).readings:
+                channel = self.channels.setdefault(reading.channel, ChannelReadings(reading.unit))
+                channel.times_ns.append(reading.time_ns)
+                channel.values.append(reading.value)
+            return
         match message.topic:
             case messages.EVENT:
                 self.events.append(messages.decode_event(message.data, message.time_ns))
             case messages.STEP:
                 self.marks.append(messages.decode_step(message.data, message.time_ns))
-            case topic if topic in messages.KIND_OF_TOPIC:
-                for reading in messages.decode_batch(topic, message.data, message.time_ns).readings:
-                    channel = self.channels.setdefault(reading.channel, ChannelReadings(reading.unit))
-                    channel.times_ns.append(reading.time_ns)
-                    channel.values.append(reading.value)
             case _:
                 pass  # what viewers read: the same things in another form
 
@@ -756,12 +757,17 @@ class _Look:
                 yield from (place.meta for place in frame_places(each.file.path))
 
     def _silent_devices(self) -> Iterator[SessionFinding]:
-        """Devices that were declared and of which a complete run has no reading."""
+        """Devices, and channels of others, that were declared and of which a complete run has no reading."""
         if not isinstance(self._manifest, Manifest) or self._run is not RunOutcome.COMPLETE or self._extent is not None:
             return
         heard = {name.partition(".")[0] for name in self._recorded.channels}
         for name in sorted(self._manifest.devices.keys() - heard):
             yield _note(f"{name}: no reading of this device is recorded, though it was declared")
+        for name in sorted(self._manifest.devices.keys() & heard):
+            declared = self._manifest.devices[name].get("channels", {})
+            for channel in declared if isinstance(declared, dict) else ():
+                if channel not in self._recorded.channels:
+                    yield _note(f"{channel}: no reading of this channel is recorded, though it was declared")
 
 
 def _is_utf_8(text: str) -> bool:

@@ -51,7 +51,7 @@ from thermostand.recording.format.mcap_bytes import (
     stream,
 )
 from thermostand.recording.format.messages import frame_table
-from thermostand.recording.format.records import RecordedMessage
+from thermostand.recording.format.records import RecordedMessage, recorded_form
 from thermostand.recording.format.summary import Summary, read_summary
 
 _DATA_END_BYTES = RECORD.size + CRC.size
@@ -254,7 +254,7 @@ class _Walk:
                 channel = self._index.channels[number]  # the first chunk, which has it too, may be damaged
                 schema = self._index.schemas[channel.schema_id].name
                 data_bytes = b"" if schema == IMAGE_SCHEMA else bytes(content[MESSAGE.size :])
-                message = RecordedMessage(channel.topic, sequence, time_ns, data_bytes)
+                message = RecordedMessage(channel.topic, sequence, time_ns, data_bytes, recorded_form(channel))
                 placed.append(_Placed(number, offset, time_ns, schema, message))
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream(content))

@@ -24,6 +24,7 @@ from thermostand.foundation.errors import NotThere, SessionError
 from thermostand.foundation.items import Event, Item, Original, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
+from thermostand.recording.format.batches import READINGS
 from thermostand.recording.format.damage import FileDamaged, naming
 from thermostand.recording.format.decoded_items import (
     RecordedImage,
@@ -37,7 +38,6 @@ from thermostand.recording.format.decoded_items import (
 from thermostand.recording.format.holes import Hole
 from thermostand.recording.format.inventory import SegmentState, inventory, misplaced
 from thermostand.recording.format.layout import (
-    DEVICES,
     FINISHED,
     FRAMES,
     TELEMETRY,
@@ -53,7 +53,7 @@ from thermostand.recording.format.records import (
     telemetry_messages,
 )
 from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
-from thermostand.recording.reading.columns import Column, TopicColumns
+from thermostand.recording.reading.columns import Column, ReadingColumns
 from thermostand.recording.reading.frames_table import FramesTable, frames_table
 from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import Depth, Scan, frames_of_plan, scan
@@ -138,7 +138,8 @@ class Session:
         return sorted(self._all_columns())
 
     def units(self) -> Mapping[str, str]:
-        """The unit of each channel that has readings, as it was recorded first."""
+        """The unit of each channel that has readings. One whose unit was another one before has it in its name,
+        `lab.pressure (mbar)`."""
         return {channel: self._units[channel] for channel in self.channels()}
 
     def readings(self, channel: str) -> Column:
@@ -165,28 +166,18 @@ class Session:
         return {channel: column for columns in self._columns.values() for channel, column in columns.items()}
 
     def _read_columns(self, device: str | None) -> dict[str, dict[str, Column]]:
-        """Device -> channel -> column of the topics that `device` publishes on (None: of all), and of devices that
-        share them, but only where they do."""
-        topics: dict[str, TopicColumns] = {}
+        """Device -> channel -> column, of `device` alone (None: of all)."""
+        found = ReadingColumns()
 
         def is_wanted(channel: Channel) -> bool:
-            devices = channel.metadata.get(DEVICES, "").split(",")
-            return channel.topic in messages.KIND_OF_TOPIC and (device is None or device in devices)
+            return channel.topic.startswith(READINGS) and device in (None, channel.topic.removeprefix(READINGS))
 
-        def add(message: RecordedMessage) -> None:
-            if message.topic not in topics:
-                topics[message.topic] = TopicColumns(message.topic)
-            topics[message.topic].add(message.data, message.time_ns)
-
-        for _ in self._decoded(is_wanted, add):
+        for _ in self._decoded(is_wanted, found.add):
             pass
-        columns: dict[str, dict[str, Column]] = {}
-        for topic in topics.values():
-            with naming(self.path / TELEMETRY):
-                for name, of_device in topic.columns().items():
-                    columns.setdefault(name, {}).update(of_device)
-                self._units |= topic.units
-                self._doubted |= topic.doubted
+        with naming(self.path / TELEMETRY):
+            columns = found.columns()
+        self._units |= found.units
+        self._doubted |= found.doubted
         return columns
 
     def steps(self) -> list[StepMark]:

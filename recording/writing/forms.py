@@ -10,6 +10,7 @@ from mcap.writer import CompressionType
 
 from thermostand.foundation.clock import seconds_ns
 from thermostand.recording.format import messages
+from thermostand.recording.format.batches import BatchForm, RecordedDevice, batch_form
 from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
 from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
@@ -22,11 +23,11 @@ TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it continues when f
 
 @dataclass(frozen=True, slots=True)
 class SessionForm:
-    """metadata: of the session; attachments: texts by name; devices: name -> kind."""
+    """metadata: of the session; attachments: texts by name; devices: by name."""
 
     metadata: Mapping[str, str]
     attachments: Mapping[str, str]
-    devices: Mapping[str, str]
+    devices: Mapping[str, RecordedDevice]
     settings: RecordingSettings
 
     def manifest(self) -> Manifest:
@@ -67,28 +68,28 @@ class SessionForm:
         )
 
 
-def declared(device: str, kind: str) -> dict[str, object]:
-    """What the manifest says of a device: its kind, and its channels, each with its units."""
-    channels: dict[str, str] = {}
-    for quantity in messages.KINDS[kind].quantities:
-        name = f"{device}.{quantity.name}"
-        channels[name] = f"{channels[name]} or {quantity.unit}" if name in channels else quantity.unit
-    return {"kind": kind, "channels": channels}
+def declared(device: str, recorded: RecordedDevice) -> dict[str, object]:
+    """What the manifest says of a device: its kind, and its channels, each with its unit."""
+    return {"kind": recorded.kind, "channels": {f"{device}.{each.name}": each.unit for each in recorded.channels}}
 
 
-def telemetry_topics(devices: Mapping[str, str]) -> tuple[Topic, ...]:
-    """The topics that these devices (name -> kind) need, and those every session has."""
-    kinds = set(devices.values())
-    names = [kind.topic for name, kind in messages.KINDS.items() if name in kinds]
-    names += [messages.TABLE_POSE] * ("axis" in kinds) + [messages.ORIGINAL] * ("imager" in kinds)
+def telemetry_topics(devices: Mapping[str, RecordedDevice]) -> tuple[Topic, ...]:
+    """One for the readings of each of these devices, by name, and those every session has."""
+    kinds = {device.kind for device in devices.values()}
+    names = [messages.TABLE_POSE] * ("axis" in kinds) + [messages.ORIGINAL] * ("imager" in kinds)
     names += [messages.STEP, messages.EVENT, messages.LOG]
-    on = {name: tuple(each for each, kind in devices.items() if messages.KINDS[kind].topic == name) for name in names}
-    return tuple(Topic(name, messages.CLASSES[name], on[name]) for name in names)
+    own = (readings_topic(batch_form(name, device)) for name, device in devices.items())
+    return (*own, *(Topic(name, messages.CLASSES[name]) for name in names))
 
 
-def frames_topics(devices: Mapping[str, str]) -> tuple[Topic, ...]:
+def readings_topic(form: BatchForm) -> Topic:
+    """The topic of a device."""
+    return Topic(form.topic, form.message, form.metadata)
+
+
+def frames_topics(devices: Mapping[str, RecordedDevice]) -> tuple[Topic, ...]:
     """Of the cameras among these devices; one that is not among them gets its topics with its first frame."""
-    cameras = [name for name, kind in devices.items() if kind == "camera"]
+    cameras = [name for name, device in devices.items() if device.kind == "camera"]
     return tuple(frames_topic(name) for camera in cameras for name in frame_topics(f"{camera}.image"))
 
 

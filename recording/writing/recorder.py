@@ -26,6 +26,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
+from thermostand.recording.format.batches import RecordedDevice
 from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.forms import SessionForm
@@ -61,7 +62,7 @@ class Recorder:
         directory: Path,
         info: SessionInfo,
         attachments: Mapping[str, str],
-        devices: Mapping[str, str],
+        devices: Mapping[str, RecordedDevice],
         hub: Hub,
         clock: Clock,
         *,

@@ -21,7 +21,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,7 +36,6 @@ from thermostand.foundation.files import sync_folder
 from thermostand.recording.format.damage import DAMAGE
 from thermostand.recording.format.images import META_SCHEMA
 from thermostand.recording.format.layout import (
-    DEVICES,
     FINISHED,
     FRAME_TABLE,
     SEGMENT_METADATA,
@@ -77,11 +76,11 @@ class MessageRecord(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a series, the class of its messages and the devices that publish on it."""
+    """A topic of a series, the class of its messages and what its channel record has to say."""
 
     name: str
     message: type[Message]
-    devices: tuple[str, ...] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +232,8 @@ class Segment:
         if name not in self._schemas:
             files = build_file_descriptor_set(topic.message).SerializeToString()
             self._schemas[name] = self._writer.add_schema(name, SchemaEncoding.Protobuf, files)
-        devices = {DEVICES: ",".join(topic.devices)} if topic.devices else {}
-        channel = self._writer.add_channel(topic.name, MessageEncoding.Protobuf, self._schemas[name], devices)
+        schema = self._schemas[name]
+        channel = self._writer.add_channel(topic.name, MessageEncoding.Protobuf, schema, topic.metadata)
         self._table.know(channel, name)
         return channel
 

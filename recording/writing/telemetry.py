@@ -6,11 +6,8 @@ are encoded and committed by a lane's thread, off the loop.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-
-from google.protobuf.message import Message
 
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock
@@ -19,7 +16,7 @@ from thermostand.foundation.events import TELEMETRY_NOT_SAVED, TELEMETRY_SAVED_A
 from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
 from thermostand.foundation.readings import Frame, Quality
 from thermostand.recording.format import messages
-from thermostand.recording.format.kinds import KINDS, Kind
+from thermostand.recording.format.batches import RecordedDevice, batch_form
 from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.writing.homes import FolderContents, Homes
 from thermostand.recording.writing.notices import DroppedReadings
@@ -38,7 +35,7 @@ class Telemetry:
     def __init__(
         self,
         directory: Path,
-        devices: Mapping[str, str],
+        devices: Mapping[str, RecordedDevice],
         *,
         settings: RecordingSettings,
         clock: Clock,
@@ -123,28 +120,24 @@ class Telemetry:
 
 
 class TelemetryEncoder:
-    """Items of the hub to records of the telemetry series; `devices` maps a device's name to its kind."""
+    """Items of the hub to records of the telemetry series; devices: by name."""
 
-    def __init__(self, devices: Mapping[str, str]) -> None:
-        unknown = sorted({kind for kind in devices.values() if kind not in KINDS})
-        if unknown:
-            raise ValueError(f"no device kind {', '.join(unknown)}; there are {', '.join(KINDS)}")
-        self._devices = dict(devices)
-        self._encoders = {name: BatchEncoder(name, KINDS[kind]) for name, kind in self._devices.items()}
+    def __init__(self, devices: Mapping[str, RecordedDevice]) -> None:
+        self._forms = {name: batch_form(name, device) for name, device in devices.items()}
         self._table: dict[str, float] = {}  # unit -> last position of the axis in that unit
 
     def check(self, item: Item) -> None:
         """ValueError when the item is a batch of a device that was not declared."""
-        if isinstance(item, Batch) and item.device not in self._encoders:
-            raise ValueError(f"{item.device} is not among the recorded devices {', '.join(self._encoders)}")
+        if isinstance(item, Batch) and item.device not in self._forms:
+            raise ValueError(f"{item.device} is not among the recorded devices {', '.join(self._forms)}")
 
     def encode(self, item: Item) -> Iterator[MessageRecord]:
         """The item's records, most often one; a frame has none."""
         match item:
             case Batch():
-                encoder = self._encoders[item.device]
-                yield MessageRecord(encoder.topic, item.time_ns, encoder.encode(item))
-                if self._devices[item.device] == "axis":
+                form = self._forms[item.device]
+                yield MessageRecord(form.topic, item.time_ns, form.encode(item))
+                if form.device.kind == "axis":
                     yield from self._pose(item)
             case Frame():
                 pass
@@ -166,37 +159,6 @@ class TelemetryEncoder:
         if "mm" in self._table and "deg" in self._table:
             pose = messages.encode_table_pose(batch.time_ns, self._table["mm"], self._table["deg"])
             yield MessageRecord(messages.TABLE_POSE, batch.time_ns, pose)
-
-
-class BatchEncoder:
-    """The batches of one device as messages of its kind; the look-ups are done once."""
-
-    def __init__(self, device: str, kind: Kind) -> None:
-        self.topic = kind.topic
-        self._class = messages.CLASSES[kind.topic]
-        self._blank: dict[str, object] = {"device": device, **{q.field: math.nan for q in kind.quantities}}
-        self._fields = {(f"{device}.{q.name}", q.unit): (q.field, f"{q.field}_quality") for q in kind.quantities}
-
-    def encode(self, batch: Batch) -> bytes:
-        """The batch as one message; nothing of a reading is lost, for any channel, unit or time."""
-        fields = self._blank.copy()
-        readings = batch.readings
-        time_ns = (readings[0].time_ns if readings else 0) or batch.time_ns  # 0 in the message is the log time
-        if time_ns != batch.time_ns:
-            fields["time_ns"] = time_ns
-        is_repeated = len({(reading.channel, reading.unit) for reading in readings}) < len(readings)
-        remarks: list[Message] = []
-        for reading in readings:
-            names = self._fields.get((reading.channel, reading.unit))
-            if names is not None:
-                value = reading.value
-                fields[names[0]] = value if value == value else math.nan
-                fields[names[1]] = messages.QUALITY_NUMBER[reading.quality]
-            if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
-                remarks.append(messages.remark_of(reading))
-        if remarks:
-            fields["remarks"] = remarks
-        return self._class(**fields).SerializeToString()
 
 
 class TelemetryWriter:

@@ -21,11 +21,10 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.markers.target import Target
 from thermostand.recording.format.images import MarkerWindows
-from thermostand.recording.format.kinds import KINDS
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
-from thermostand.stand.assembly import Assembly, device_kinds
+from thermostand.stand.assembly import Assembly, recorded_devices
 from thermostand.stand.config.stand_config import RecordingConfig, StandConfig
 from thermostand.stand.estimating.absent import absences
 from thermostand.stand.running.order import Order
@@ -104,8 +103,8 @@ def recorder_in(
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
-    kinds = {name: kind if kind in KINDS else "relays" for name, kind in device_kinds(config).items()}
-    return Recorder(directory, info, attachments, kinds, hub, clock, settings=settings, prepare=windows, disk=disk)
+    devices = recorded_devices(config)
+    return Recorder(directory, info, attachments, devices, hub, clock, settings=settings, prepare=windows, disk=disk)
 
 
 def _commit_s(recording: RecordingConfig, clock: Clock) -> float:

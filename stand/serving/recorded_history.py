@@ -12,9 +12,9 @@ import numpy as np
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.items import Batch
+from thermostand.recording.format.batches import READINGS
 from thermostand.recording.format.decoded_items import item_of
 from thermostand.recording.format.layout import FINISHED, TELEMETRY
-from thermostand.recording.format.messages import KIND_OF_TOPIC
 from thermostand.recording.format.records import telemetry_messages
 from thermostand.recording.reading.session import Session
 from thermostand.stand.serving.live_history import COARSE_CELLS, COARSE_S, Columns, History
@@ -61,7 +61,7 @@ def _units_of(session: Session) -> dict[str, str]:
     """Channel -> unit, from the first readings: a column has none."""
     units: dict[str, str] = {}
     for segment in session.telemetry_segments[:1]:
-        found = telemetry_messages(segment, lambda channel: channel.topic in KIND_OF_TOPIC)
+        found = telemetry_messages(segment, lambda channel: channel.topic.startswith(READINGS))
         for item in map(item_of, islice(found, _LOOKED_AT)):
             if isinstance(item, Batch):
                 units |= {reading.channel: reading.unit for reading in item.readings}

@@ -22,6 +22,7 @@ from mcap.writer import CompressionType
 
 from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
 from tests.compensation.rendered import Scene, photograph, render
+from tests.recording.declared import declared
 from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Item, StepMark, StepState
@@ -46,7 +47,7 @@ SEQUENCE = (
     *(("fit", degC) for degC in (31.0, 45.0, 52.0, 38.0, 10.0, 17.0)),
     *(("validation", degC) for degC in (27.0, 41.0, 48.0, 13.0, 20.0)),
 )
-DEVICES = {"thermometers": "thermometers", "camera": "camera"}
+DEVICES = declared({"thermometers": "thermometers", "camera": "camera"})
 PEER = "cv2.findCirclesGrid, 2 workers, nothing else"
 
 

@@ -22,12 +22,14 @@ from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
 from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
+from tests.recording.declared import PLACES
 from tests.recording.recordings import DEVICES
 from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame, Reading
-from thermostand.recording.format import kinds, messages
+from thermostand.recording.format import messages
+from thermostand.recording.format.batches import batch_form
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import telemetry_topics
@@ -42,8 +44,8 @@ HEIGHT_px, WIDTH_px = 2048, 2448
 FRAMES_PER_SEGMENT = 200  # 1.0 GB
 SEGMENTS = 5
 NIGHT_s = 16 * 3600
-TEMPERATURES = tuple(f"thermometers.{place}" for place in kinds.THERMOMETERS)
-TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in kinds.THERMOMETERS)
+TEMPERATURES = tuple(f"thermometers.{place}" for place in PLACES)
+TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in PLACES)
 METADATA = {"format": str(FORMAT), "session_id": "bench"}
 ATTACHMENTS = {"config.yaml": "a: 1\n" * 400}
 
@@ -107,13 +109,12 @@ def _write_telemetry(session: Path, duration_s: int) -> None:
 
 
 def _batches(second: int) -> Iterator[Batch]:
-    for index, (device, kind) in enumerate(DEVICES.items()):
+    for index, (device, recorded) in enumerate(DEVICES.items()):
         time_ns = START_NS + second * NS_PER_S + index
         values = random.Random(second * len(DEVICES) + index)
         readings = [
-            Reading(f"{device}.{quantity.name}", round(values.gauss(20, 1), 2), quantity.unit, time_ns)
-            for quantity in kinds.KINDS[kind].quantities
-            if (device, quantity.unit) not in {("linear", "deg"), ("rotary", "mm")}
+            Reading(f"{device}.{channel.name}", round(values.gauss(20, 1), 2), channel.unit, time_ns)
+            for channel in recorded.channels
         ]
         yield Batch(device, time_ns, tuple(readings))
 
@@ -235,8 +236,8 @@ def _peer_temperatures(session: Path) -> list[NDArray[np.float64]]:
 
 
 def _peer_rows(path: Path) -> Iterable[list[float]]:
-    topic = kinds.KINDS["thermometers"].topic
-    parse = messages.CLASSES[topic].FromString
+    form = batch_form("thermometers", DEVICES["thermometers"])
+    topic, parse = form.topic, form.message.FromString
     with path.open("rb") as file:
         for _, _, message in make_reader(file, validate_crcs=True).iter_messages([topic]):
             decoded = parse(message.data)

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tests.addresses import WORKER
+from tests.recording.declared import declared
 from thermostand.compensation.reporting.drawing import figures
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.hub import Hub
@@ -97,7 +98,7 @@ async def recording(
     clock, hub = VirtualClock(START_NS), Hub()
     info = SessionInfo(session_id or directory.name, recipe, serials, "operator", "0.1.0", "virtual")
     settings = RecordingSettings(telemetry_commit_s=60.0)
-    recorder = Recorder(directory, info, dict(attachments), dict(devices), hub, clock, settings=settings)
+    recorder = Recorder(directory, info, dict(attachments), declared(devices), hub, clock, settings=settings)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
     yield hub, clock

@@ -9,6 +9,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
+from tests.recording.declared import form as declared_form
 from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Event
@@ -19,18 +20,18 @@ from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, read_manifest
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
+from thermostand.recording.writing.forms import readings_topic
 from thermostand.recording.writing.manifest_file import complete_manifest
 from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
-from thermostand.recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "Zoë"}
 ATTACHMENTS = {"config.yaml": "camera: {gain_dB: 0.0}\n" * 20, "recipe.yaml": "name: night\n"}
-ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
+ENCODER = declared_form("thermometers")
 TOPICS = {
     TELEMETRY: (
-        Topic(ENCODER.topic, messages.CLASSES[ENCODER.topic], ("thermometers",)),
+        readings_topic(ENCODER),
         Topic(messages.EVENT, messages.CLASSES[messages.EVENT]),
     ),
     FRAMES: CAMERA_TOPICS,

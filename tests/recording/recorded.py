@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.recording.declared import declared
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
@@ -19,8 +20,8 @@ START_NS = 1_767_290_400 * NS_PER_S + 123_456_789
 MS = 1_000_000
 INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "wall", host="laboratory")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\r\n"}
-DEVICES = {"thermometers": "thermometers", "regulator": "regulator", "camera": "camera"}
-DEVICES |= {"rotary": "axis", "linear": "axis"}
+DEVICES = declared({"thermometers": "thermometers", "regulator": "regulator", "camera": "camera"})
+DEVICES |= declared({"rotary": "axis", "linear": "axis"})
 
 
 def frame(time_ns, index, dtype=np.uint8):

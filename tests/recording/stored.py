@@ -1,12 +1,13 @@
 """Frames as they are recorded, and the topics of the leading camera."""
 
+from tests.recording.declared import declared
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.images import Circumstances
 from thermostand.recording.writing.forms import frames_topics
 from thermostand.recording.writing.frames import PublishedFrame, frame_records
 from thermostand.recording.writing.segment import MessageRecord
 
-CAMERA_TOPICS = frames_topics({"camera": "camera"})
+CAMERA_TOPICS = frames_topics(declared({"camera": "camera"}))
 
 
 def stored(frame: Frame, published_ns: int | None = None) -> list[MessageRecord]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from tests.recording.declared import declared
 from tests.recording.disks import ext4, limit_files, run, tmpfs
 from thermostand.foundation.clock import NS_PER_S, VirtualClock, WallClock
 from thermostand.foundation.errors import SessionError
@@ -23,7 +24,7 @@ START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
 SETTINGS = RecordingSettings("raw", segment_s=2.0, stop_frames_below_bytes=0, alert_below_fraction=0.0)
-DEVICES = {"thermometers": "thermometers"}
+DEVICES = declared({"thermometers": "thermometers"})
 
 
 class Stand:

@@ -23,16 +23,16 @@ from thermostand.recording.reading.session import Session
 
 # channel of the session -> table and column of the export
 CHANNELS = {
-    "thermometers.air": ("sensors_temperature", "air_degC"),
-    "thermometers.artifact": ("sensors_temperature", "artifact_degC"),
-    "regulator.pv": ("chamber_state", "actual_degC"),
-    "linear.position": ("table_state", "position_mm"),
-    "rotary.position": ("table_state", "position_deg"),
+    "thermometers.air": ("thermometers", "air_degC"),
+    "thermometers.artifact": ("thermometers", "artifact_degC"),
+    "regulator.pv": ("regulator", "pv_degC"),
+    "linear.position": ("linear", "position_mm"),
+    "rotary.position": ("rotary", "position_deg"),
 }
 
 
 def assert_readings_equal(session, channel, rows, column):
-    mine = [row for row in rows if row["device"] == channel.partition(".")[0] and row[f"{column}_quality"]]
+    mine = [row for row in rows if row[f"{column}_quality"]]
     times_ns, values = session.readings(channel)
     assert [int(row["time_ns"]) for row in mine] == times_ns.tolist()
     np.testing.assert_array_equal([float(row[column]) for row in mine], values)
@@ -44,22 +44,22 @@ async def test_csv_reads_back_every_value_exactly(tmp_path):
     assert sorted(CHANNELS) == session.channels()
     for channel, (table, column) in CHANNELS.items():
         assert_readings_equal(session, channel, csv_rows(out / "telemetry" / f"{table}.csv"), column)
-    raw = (out / "telemetry" / "sensors_temperature.csv").read_bytes()
+    raw = (out / "telemetry" / "thermometers.csv").read_bytes()
     header, first = raw.split(b"\r\n")[:2]
-    assert header.startswith(b"time_ns,time_utc,device,granite_inside_degC,granite_inside_degC_quality,")
+    assert header.startswith(b"time_ns,time_utc,granite_inside_degC,granite_inside_degC_quality,")
     assert b"0.30000000000000004" in raw
-    assert f"{START_NS - 3 * MS},2026-01-01T18:00:00.120456789Z,thermometers,,," in first.decode()
+    assert f"{START_NS - 3 * MS},2026-01-01T18:00:00.120456789Z,,," in first.decode()
 
 
 async def test_parquet_reads_back_every_value_exactly_and_typed(tmp_path):
     session, out = await exported(tmp_path, telemetry="parquet")
     for channel, (table, column) in CHANNELS.items():
         assert_readings_equal(session, channel, parquet_rows(out / "telemetry" / f"{table}.parquet"), column)
-    schema = pyarrow.parquet.read_schema(out / "telemetry" / "sensors_temperature.parquet")
+    schema = pyarrow.parquet.read_schema(out / "telemetry" / "thermometers.parquet")
     types = {name: str(schema.field(name).type) for name in ("time_ns", "time_utc", "air_degC", "remarks")}
     assert types == {"time_ns": "int64", "time_utc": "timestamp[ns, tz=UTC]", "air_degC": "double", "remarks": "string"}
-    assert str(schema.field("device").type).startswith("dictionary<values=string")
-    table = pyarrow.parquet.read_table(out / "telemetry" / "sensors_temperature.parquet")
+    assert str(schema.field("air_degC_quality").type).startswith("dictionary<values=string")
+    table = pyarrow.parquet.read_table(out / "telemetry" / "thermometers.parquet")
     assert table["time_utc"].cast("int64").to_pylist() == table["time_ns"].to_pylist()
     assert table["laboratory_degC"].null_count == len(table), "what was not measured is empty, not NaN"
 
@@ -67,9 +67,7 @@ async def test_parquet_reads_back_every_value_exactly_and_typed(tmp_path):
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])
 async def test_reasons_and_qualities_are_reported(tmp_path, table_format):
     _, out = await exported(tmp_path, telemetry=table_format)
-    rows = (csv_rows if table_format == "csv" else parquet_rows)(
-        out / "telemetry" / f"sensors_temperature.{table_format}"
-    )
+    rows = (csv_rows if table_format == "csv" else parquet_rows)(out / "telemetry" / f"thermometers.{table_format}")
     assert len(rows) == 24, "the readings of a batch that have two instants are two rows"
     bad, stale = rows[8], rows[9]
     assert bad["air_degC_quality"] == "bad"
@@ -81,7 +79,7 @@ async def test_reasons_and_qualities_are_reported(tmp_path, table_format):
 
 
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])
-async def test_quantities_of_other_names_have_columns_and_a_second_unit_is_in_the_remarks(tmp_path, table_format):
+async def test_quantities_that_were_not_declared_have_columns_each_unit_its_own(tmp_path, table_format):
     def items(time_ns, index):
         readings = (
             Reading("thermometers.humidity", 45.25, "%", time_ns),
@@ -96,9 +94,7 @@ async def test_quantities_of_other_names_have_columns_and_a_second_unit_is_in_th
         yield Batch("thermometers", time_ns, readings)
 
     session, out = await exported(tmp_path, count=1, items=items, telemetry=table_format)
-    rows = (csv_rows if table_format == "csv" else parquet_rows)(
-        out / "telemetry" / f"sensors_temperature.{table_format}"
-    )
+    rows = (csv_rows if table_format == "csv" else parquet_rows)(out / "telemetry" / f"thermometers.{table_format}")
     for name, column in (
         ("air", "air_degC"),
         ("pt100_7_raw", "pt100_7_raw"),
@@ -106,13 +102,9 @@ async def test_quantities_of_other_names_have_columns_and_a_second_unit_is_in_th
     ):
         assert_readings_equal(session, f"thermometers.{name}", rows, column)
     assert (float(rows[0]["pt100_7_degC"]), rows[0]["pt100_7_degC_quality"]) == (30.5, "good")
-    dew = "'=dew_degC" if table_format == "csv" else "=dew_degC"  # no spreadsheet takes a name for a formula
-    assert (math.isnan(float(rows[0][dew])), rows[0][f"{dew}_quality"]) == (True, "bad")
-    assert rows[0]["remarks"].split("; ") == [
-        "thermometers.=dew: no answer",
-        "thermometers.pt100_7 303.65 K good",
-        "thermometers.air_degC 1.0 1 good",
-    ]
+    assert (math.isnan(float(rows[0]["dew_degC"])), rows[0]["dew_degC_quality"]) == (True, "bad")
+    assert (float(rows[0]["pt100_7_K"]), float(rows[0]["air_degC_2"])) == (303.65, 1.0)
+    assert rows[0]["remarks"] == "thermometers.=dew: no answer"
 
 
 @pytest.mark.parametrize("encoding", ["zstd", "raw"])
@@ -190,8 +182,8 @@ async def test_its_readme_says_how_a_text_was_changed_and_what_was_recorded_can_
     (event,) = csv_rows(out / "events.csv")
     assert event["text"].removeprefix("'") == "=cmd|'/C calc'!A0[2J"
     assert event["text"].startswith("'")
-    (state,) = csv_rows(out / "telemetry" / "chamber_state.csv")
-    assert state["actual_degC"] == "-1.5"  # a number is no formula
+    (state,) = csv_rows(out / "telemetry" / "regulator.csv")
+    assert state["pv_degC"] == "-1.5"  # a number is no formula
 
 
 async def test_steps_events_metadata_and_attachments_are_there(tmp_path):

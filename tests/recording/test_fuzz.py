@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
+from tests.recording.declared import declared
 from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
 from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
@@ -34,7 +35,7 @@ from thermostand.recording.writing.telemetry import TelemetryEncoder
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n"}
-ENCODER = TelemetryEncoder({"camera": "camera"})
+ENCODER = TelemetryEncoder(declared({"camera": "camera"}))
 SEGMENTS = (f"{TELEMETRY}/0000.mcap", f"{FRAMES}/0000.mcap")
 LIBC, MMAP_THRESHOLD = ctypes.CDLL(None), -3  # of mallopt(3)
 MEMORY_BYTES = 192 << 20  # more than it had; the largest honest need is 64 MiB for a chunk
@@ -72,7 +73,9 @@ def write_session(directory, encoding):
     halves = ([item for k in seconds for item in items(k)] for seconds in ((0, 1), (2, 3)))
     telemetry = [[record for item in half for record in ENCODER.encode(item)] for half in halves]
     write_series(directory / FRAMES, CAMERA_TOPICS, compression, images)
-    write_series(directory / TELEMETRY, telemetry_topics({"camera": "camera"}), CompressionType.ZSTD, telemetry)
+    write_series(
+        directory / TELEMETRY, telemetry_topics(declared({"camera": "camera"})), CompressionType.ZSTD, telemetry
+    )
 
 
 def write_series(folder, topics, compression, commits):

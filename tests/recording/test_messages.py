@@ -8,11 +8,12 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.recording.declared import KINDS, form
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
-from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
+from thermostand.foundation.readings import Channel, Frame, Quality, Reading, bad_reading
 from thermostand.recording.format import messages
-from thermostand.recording.writing.telemetry import BatchEncoder
+from thermostand.recording.format.batches import RecordedDevice, batch_form, form_of
 
 TIME_NS = 1_767_290_400_123_456_789
 
@@ -33,8 +34,8 @@ def frame(image, **changes):
 
 
 def round_trip(kind, batch):
-    encoder = BatchEncoder(batch.device, messages.KINDS[kind])
-    return messages.decode_batch(encoder.topic, encoder.encode(batch), batch.time_ns).readings
+    encoder = form(batch.device, kind)
+    return encoder.decode(encoder.encode(batch), batch.time_ns).readings
 
 
 def same(left, right):
@@ -45,9 +46,9 @@ def same(left, right):
 
 def test_temperatures_have_the_fields_and_values_a_viewer_expects():
     readings = (Reading("pt.air", 23.98, "degC", TIME_NS), bad_reading("pt.artifact", "degC", TIME_NS, "sensor break"))
-    encoder = BatchEncoder("pt", messages.KINDS["thermometers"])
-    message = messages.CLASSES["/sensors/temperature"].FromString(encoder.encode(Batch("pt", TIME_NS, readings)))
-    assert message.DESCRIPTOR.full_name == "thermostand.Temperatures"
+    encoder = form("pt", "thermometers")
+    message = encoder.message.FromString(encoder.encode(Batch("pt", TIME_NS, readings)))
+    assert message.DESCRIPTOR.full_name == "thermostand.pt"
     assert [field.name for field in message.DESCRIPTOR.fields][:5] == [
         "device",
         "remarks",
@@ -72,8 +73,8 @@ quality_and_value = st.one_of(
 @st.composite
 def batches(draw):
     """A kind and a batch of any part of its quantities, with strangers, reasons and times of their own."""
-    kind = draw(st.sampled_from(sorted(messages.KINDS)))
-    known = [(q.name, q.unit) for q in messages.KINDS[kind].quantities]
+    kind = draw(st.sampled_from(KINDS))
+    known = [(each.name, each.unit) for each in form("dev", kind).device.channels]
     names = draw(st.lists(st.sampled_from([*known, ("humidity", "%"), (known[0][0], "K")]), unique=True))
     readings = []
     for name, unit in names:
@@ -90,18 +91,38 @@ def test_no_batch_loses_anything(case):
     assert same(round_trip(kind, batch), batch.readings)
 
 
-def test_two_axes_share_a_topic_and_keep_their_units_apart():
-    topic = messages.KINDS["axis"].topic
-    encoded = BatchEncoder("rotary", messages.KINDS["axis"]).encode(
-        Batch("rotary", TIME_NS, (Reading("rotary.position", 12.5, "deg", TIME_NS),))
-    )
-    message = messages.CLASSES[topic].FromString(encoded)
-    assert message.position_deg == 12.5
-    assert math.isnan(message.position_mm)
+names = st.text("abz_09", min_size=1, max_size=3)
+units = st.sampled_from(["", "1", "%", "degC", "mm", "l/min", "m^3/h", "µm", "Ω", "percent"])
+
+
+@given(st.lists(st.builds(Channel, names, units, st.just("")), unique=True, max_size=6))
+def test_channels_of_any_name_and_unit_have_a_field_each_and_are_known_again(channels):
+    known = batch_form("dev", RecordedDevice("added", tuple(channels)))
+    assert form_of(known.metadata) is known
+    assert len(set(known.fields)) == len(channels)
+    readings = tuple(Reading(f"dev.{each.name}", 1.5 + at, each.unit, TIME_NS) for at, each in enumerate(channels))
+    data = known.encode(Batch("dev", TIME_NS, readings))
+    assert known.decode(data, TIME_NS).readings == readings
+    assert not known.message.FromString(data).remarks
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {},
+        {"device": "../dev", "kind": "", "channels": "[]"},
+        {"device": "dev", "kind": "", "channels": "{}"},
+        {"device": "dev", "kind": "", "channels": '[["a"]]'},
+        {"device": "dev", "kind": "", "channels": '[["a","m",""],["a","m",""]]'},
+    ],
+)
+def test_a_topic_that_does_not_say_what_it_holds_is_refused(metadata):
+    with pytest.raises(ValueError, match=r"channel|device|list"):
+        form_of(metadata)
 
 
 def test_nan_is_the_same_bytes_whatever_arithmetic_made_it():
-    encoder = BatchEncoder("pt", messages.KINDS["thermometers"])
+    encoder = form("pt", "thermometers")
     negative_nan = float(np.copysign(np.nan, -1.0))
 
     def encode(nan):
@@ -113,7 +134,7 @@ def test_nan_is_the_same_bytes_whatever_arithmetic_made_it():
 def test_one_instant_shared_by_a_batch_costs_no_remarks():
     def size(time_ns):
         readings = tuple(Reading(f"pt.{n}", 20.0, "degC", time_ns) for n in ("air", "artifact", "laboratory"))
-        return len(BatchEncoder("pt", messages.KINDS["thermometers"]).encode(Batch("pt", TIME_NS, readings)))
+        return len(form("pt", "thermometers").encode(Batch("pt", TIME_NS, readings)))
 
     assert size(TIME_NS - 5_000_000) - size(TIME_NS) == 9
 
@@ -150,7 +171,7 @@ def test_the_table_pose_is_metres_and_a_turn_about_z():
 @given(st.binary(max_size=60))
 def test_random_bytes_are_a_message_or_a_session_error(data):
     decoders = [
-        lambda: messages.decode_batch("/sensors/temperature", data, TIME_NS),
+        lambda: form("pt", "thermometers").decode(data, TIME_NS),
         lambda: messages.decode_step(data, TIME_NS),
         lambda: messages.decode_event(data, TIME_NS),
         lambda: messages.decode_frame_meta(data),

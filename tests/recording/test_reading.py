@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 
+from tests.recording.declared import KINDS, declared, form
 from tests.recording.fuzzed import put_together, take_apart
 from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
 from tests.recording.stored import CAMERA_TOPICS, stored
@@ -17,8 +18,12 @@ from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, StepMark, StepState
-from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
+from thermostand.foundation.readings import Channel, Frame, Quality, Reading, bad_reading
+from thermostand.recording.exporting.export import export
+from thermostand.recording.exporting.topics import recorded_devices
+from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format import messages
+from thermostand.recording.format.batches import RecordedDevice
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.records import frame_places, telemetry_messages
 from thermostand.recording.reading.session import Session
@@ -26,7 +31,7 @@ from thermostand.recording.writing.forms import frames_topics, telemetry_topics
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.recording.writing.segment import MessageRecord, SeriesForm
 from thermostand.recording.writing.series import Series
-from thermostand.recording.writing.telemetry import BatchEncoder, TelemetryEncoder
+from thermostand.recording.writing.telemetry import TelemetryEncoder
 
 METADATA = {"format": str(FORMAT), "session_id": "night-1"}
 
@@ -99,14 +104,17 @@ async def test_items_recorded_again_are_the_same_messages(tmp_path):
     assert images(second) == images(first)
 
 
-kinds = st.sampled_from(sorted(messages.KINDS))
+kinds = st.sampled_from(KINDS)
 
 
 @st.composite
 def batches(draw):
     """Any batch of a device: readings in any order, repeated, of other devices, with times and reasons of their own."""
     kind = draw(kinds)
-    names = [(f"dev.{q.name}", q.unit) for q in messages.KINDS[kind].quantities] + [("dev.new", "%"), ("x.y", "K")]
+    names = [(f"dev.{each.name}", each.unit) for each in form("dev", kind).device.channels] + [
+        ("dev.new", "%"),
+        ("x.y", "K"),
+    ]
     time_ns = draw(st.sampled_from([1, START_NS]))
     readings = []
     for channel, unit in draw(st.lists(st.sampled_from(names), max_size=8)):
@@ -120,9 +128,9 @@ def batches(draw):
 @given(batches())
 def test_a_batch_read_and_encoded_again_is_the_same_bytes_and_lost_nothing(case):
     kind, original = case
-    encoder = BatchEncoder("dev", messages.KINDS[kind])
+    encoder = form("dev", kind)
     data = encoder.encode(original)
-    decoded = messages.decode_batch(encoder.topic, data, original.time_ns)
+    decoded = encoder.decode(data, original.time_ns)
     assert encoder.encode(decoded) == data
     assert comparable(decoded) == comparable(original)
 
@@ -146,7 +154,7 @@ def test_a_frame_comes_behind_what_was_published_at_its_instant_and_before_the_e
 def test_frames_of_one_instant_are_distinguished_by_their_camera_and_number(tmp_path):
     write_items(tmp_path, [batch(1)])
     frames = [small_frame(1, 7), replace(small_frame(1, 7), channel="side.image"), small_frame(1, 8)]
-    topics = frames_topics({"camera": "camera", "side": "camera"})
+    topics = frames_topics(declared({"camera": "camera", "side": "camera"}))
     write(tmp_path / FRAMES, topics, list(map(stored, frames)), CompressionType.ZSTD)
     session = Session.open(tmp_path)
     assert [(frame.channel, frame.block_id) for frame in session.frames()] == [
@@ -273,15 +281,39 @@ def test_columns_know_absent_bad_and_unforeseen_readings(tmp_path):
     np.testing.assert_array_equal(session.readings("thermometers.air")[1], [np.nan, 20.0])
 
 
-def test_a_device_that_joined_a_topic_later_takes_nothing_from_the_first(tmp_path):
+def test_a_device_that_joined_later_takes_nothing_from_the_first(tmp_path):
     def moved(device, unit, second):
         return Batch(device, at(second), (Reading(f"{device}.position", float(second), unit, at(second)),))
 
-    write_items(tmp_path, [moved("linear", "mm", 0)], {"linear": "axis"})
-    write_items(tmp_path, [moved("linear", "mm", 1), moved("rotary", "deg", 2)], {"linear": "axis", "rotary": "axis"})
+    write_items(tmp_path, [moved("linear", "mm", 0)], declared({"linear": "axis"}))
+    both = declared({"linear": "axis", "rotary": "axis"})
+    write_items(tmp_path, [moved("linear", "mm", 1), moved("rotary", "deg", 2)], both)
     session = Session.open(tmp_path)
     assert session.readings("rotary.position")[1].tolist() == [2.0]
     assert session.readings("linear.position")[1].tolist() == [0.0, 1.0]
+
+
+def test_a_channel_whose_unit_has_changed_is_two(tmp_path):
+    def lab(value, unit, second):
+        return Batch("lab", at(second), (Reading("lab.pressure", value, unit, at(second)),))
+
+    for second, (value, unit) in enumerate([(1013.0, "hPa"), (760.0, "mmHg")]):
+        devices = {"lab": RecordedDevice("barometer", (Channel("pressure", unit, "pressure"),))}
+        write_items(tmp_path / "s", [lab(value, unit, second)], devices)
+    session = Session.open(tmp_path / "s")
+    assert session.units() == {"lab.pressure": "hPa", "lab.pressure (mmHg)": "mmHg"}
+    assert session.readings("lab.pressure")[1].tolist() == [1013.0]
+    assert session.readings("lab.pressure (mmHg)")[1].tolist() == [760.0]
+    part = Session.open(trim(session, tmp_path / "part", START_NS, at(9)))
+    assert part.units() == session.units()
+    assert list(recorded_devices(part).values()) == list(recorded_devices(session).values())
+    assert [item.readings for item in part.items() if isinstance(item, Batch)] == [
+        item.readings for item in session.items()
+    ]
+    export(session, tmp_path / "out", report=lambda done, text: None)
+    (header, *rows) = (tmp_path / "out/telemetry/lab.csv").read_text().splitlines()
+    assert header.split(",")[2::2] == ["pressure_hPa", "pressure_mmHg", "remarks"]
+    assert [row.split(",")[2:6] for row in rows] == [["1013.0", "good", "", ""], ["", "", "760.0", "good"]]
 
 
 def rewrite(path, change):
@@ -297,14 +329,14 @@ def chunks(records):
 
 def value_beside_a_bad_quality(records):
     message = chunks(records)[0].inner[-1]
-    good = messages.CLASSES["/sensors/temperature"].FromString(message.content[22:])
+    good = form("thermometers").message.FromString(message.content[22:])
     good.air_degC_quality = 3
     message.content = message.content[:22] + good.SerializeToString()
 
 
 def unknown_quality(records):
     message = chunks(records)[0].inner[-1]
-    good = messages.CLASSES["/sensors/temperature"].FromString(message.content[22:])
+    good = form("thermometers").message.FromString(message.content[22:])
     good.air_degC_quality = 9
     message.content = message.content[:22] + good.SerializeToString()
 

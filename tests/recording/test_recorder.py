@@ -22,6 +22,8 @@ from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
+from thermostand.foundation.readings import Channel
+from thermostand.recording.format.batches import RecordedDevice
 from thermostand.recording.format.manifest import MANIFEST_NAME, read_manifest
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, Saved
@@ -81,11 +83,12 @@ async def test_a_reader_no_one_here_wrote_decodes_every_message(tmp_path):
     assert {name: len(times) for name, times in seen.items()} == {
         ("/camera/image", "foxglove.RawImage"): 5,
         ("/camera/meta", "thermostand.FrameMeta"): 5,
-        ("/sensors/temperature", "thermostand.Temperatures"): 5,
-        ("/chamber/state", "thermostand.ChamberState"): 5,
-        ("/table/state", "thermostand.TableState"): 10,
+        ("/readings/thermometers", "thermostand.thermometers"): 5,
+        ("/readings/regulator", "thermostand.regulator"): 5,
+        ("/readings/linear", "thermostand.linear"): 5,
+        ("/readings/rotary", "thermostand.rotary"): 5,
         ("/table/pose", "foxglove.PoseInFrame"): 9,  # none before both axes have shown where they are
-        ("/flap/state", "thermostand.FlapState"): 5,
+        ("/readings/flap", "thermostand.flap"): 5,
         ("/experiment/step", "thermostand.Step"): 5,
         ("/experiment/event", "thermostand.Event"): 5,
         ("/log", "foxglove.Log"): 5,
@@ -128,8 +131,9 @@ async def test_a_second_run_continues_the_session(tmp_path):
 
 def test_mistakes_in_the_wiring_are_value_errors(tmp_path):
     hub, clock = Hub(), VirtualClock(START_NS)
-    with pytest.raises(ValueError, match="no device kind toaster"):
-        Recorder(tmp_path, INFO, {}, {"kitchen": "toaster"}, hub, clock)
+    twice = RecordedDevice("toaster", (Channel("crust", "degC"), Channel("crust", "degC")))
+    with pytest.raises(ValueError, match="kitchen declares one of its channels twice"):
+        Recorder(tmp_path, INFO, {}, {"kitchen": twice}, hub, clock)
     Recorder(tmp_path / "s", INFO, {}, DEVICES, hub, clock).start()
     with pytest.raises(ValueError, match="humidity is not among"):
         hub.publish(Batch("humidity", START_NS, ()))

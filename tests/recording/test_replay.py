@@ -168,7 +168,7 @@ async def test_a_session_tells_which_devices_it_recorded(tmp_path):
     await record(tmp_path / "s", 1)
     devices = recorded_devices(Session.open(tmp_path / "s"))
     assert devices == DEVICES
-    assert [name for name, kind in devices.items() if kind == "axis"] == ["rotary", "linear"]
+    assert [name for name, device in devices.items() if device.kind == "axis"] == ["rotary", "linear"]
 
 
 async def test_a_session_without_items_cannot_be_replayed(tmp_path):

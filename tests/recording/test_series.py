@@ -28,7 +28,7 @@ RECORDS_PER_COMMIT = 8
 def form(**changes):
     fields = {
         "name": "telemetry",
-        "topics": (Topic(EVENT, CLASSES[EVENT]), Topic(LOG, CLASSES[LOG], ("stand",))),
+        "topics": (Topic(EVENT, CLASSES[EVENT]), Topic(LOG, CLASSES[LOG], {"of": "stand"})),
         "compression": CompressionType.ZSTD,
         "session": SESSION,
         "attachments": ATTACHMENTS,
@@ -109,7 +109,7 @@ def test_a_finished_segment_has_few_large_chunks_with_everything_in_its_place(tm
         summary = reader.get_summary()
     assert summary.statistics.message_count == 600 * RECORDS_PER_COMMIT
     assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 5
-    assert [channel.metadata for channel in summary.channels.values()] == [{}, {"devices": "stand"}]
+    assert [channel.metadata for channel in summary.channels.values()] == [{}, {"of": "stand"}]
 
 
 def test_the_same_records_are_the_same_bytes_and_the_begin_is_that_of_the_uncompacted_file(tmp_path):

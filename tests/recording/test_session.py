@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
+from tests.recording.declared import form as declared_form
 from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
@@ -13,16 +14,16 @@ from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.forms import readings_topic
 from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
 from thermostand.recording.writing.series import Series
-from thermostand.recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n", "target.yaml": "rows: 6\n"}
-ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
+ENCODER = declared_form("thermometers")
 TELEMETRY_TOPICS = (
-    Topic(ENCODER.topic, messages.CLASSES[ENCODER.topic], ("thermometers",)),
+    readings_topic(ENCODER),
     *(Topic(name, messages.CLASSES[name]) for name in (messages.STEP, messages.EVENT)),
 )
 
@@ -224,7 +225,7 @@ def test_a_directory_that_does_not_exist_is_refused(tmp_path):
 
 
 def test_foreign_messages_on_a_topic_of_ours_are_refused(tmp_path):
-    topics = (Topic(ENCODER.topic, messages.CLASSES[messages.EVENT], ("thermometers",)),)
+    topics = (Topic(ENCODER.topic, messages.CLASSES[messages.EVENT], ENCODER.metadata),)
     data = messages.encode_event(event(0))
     write_series(
         tmp_path / TELEMETRY,
@@ -232,7 +233,7 @@ def test_foreign_messages_on_a_topic_of_ours_are_refused(tmp_path):
         form(TELEMETRY, topics, CompressionType.ZSTD),
         lambda k: [MessageRecord(ENCODER.topic, START_NS, data)],
     )
-    with pytest.raises(SessionError, match=r"/sensors/temperature holds thermostand\.Event"):
+    with pytest.raises(SessionError, match=r"/readings/thermometers holds thermostand\.Event"):
         Session.open(tmp_path).readings("thermometers.air")
 
 

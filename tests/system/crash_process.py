@@ -11,6 +11,7 @@ import os
 import sys
 from pathlib import Path
 
+from tests.recording.declared import declared
 from tests.system.recording_process import INFO, MESSAGES_PER_ROUND, SETTINGS, batches_of, frame_of
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
@@ -95,7 +96,7 @@ async def main(folder, marks_path):
     clock, hub, disk = WallClock(), Hub(), DiskProcess()
     marks = Marks(marks_path, folder / CONTROL)
     (folder / QUEUE).mkdir()
-    texts, devices = {"config.yaml": "a: 1\n"}, {"thermometers": "thermometers"}
+    texts, devices = {"config.yaml": "a: 1\n"}, declared({"thermometers": "thermometers"})
     recorder = Recorder(folder / SESSION, INFO, texts, devices, hub, clock, settings=SETTINGS, disk=disk)
     await recorder.begin(tuple)
     journal = Journal.create(folder / SESSION)

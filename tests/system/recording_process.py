@@ -18,15 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.recording.declared import declared
+from tests.recording.declared import form as declared_form
 from tests.recording.stored import stored
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame, Reading
-from thermostand.recording.format import messages
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.segment import MessageRecord
-from thermostand.recording.writing.telemetry import BatchEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 PERIOD_NS = NS_PER_S // 100
@@ -40,7 +40,7 @@ SETTINGS = RecordingSettings(
 )
 BATCHES = 2
 MESSAGES_PER_ROUND = BATCHES
-ENCODER = BatchEncoder("thermometers", messages.KINDS["thermometers"])
+ENCODER = declared_form("thermometers")
 PROGRESS = struct.Struct("<QQQQ")  # process (0: it has ended), rounds published, frames and messages saved
 
 
@@ -77,7 +77,13 @@ async def record(directory):
     """Record until killed; progress goes to the standard output."""
     clock, hub = WallClock(), Hub()
     recorder = Recorder(
-        directory, INFO, {"config.yaml": "a: 1\n"}, {"thermometers": "thermometers"}, hub, clock, settings=SETTINGS
+        directory,
+        INFO,
+        {"config.yaml": "a: 1\n"},
+        declared({"thermometers": "thermometers"}),
+        hub,
+        clock,
+        settings=SETTINGS,
     )
     recorder.start()
     running = asyncio.create_task(recorder.run())

@@ -32,7 +32,6 @@ from thermostand.stand.simulator import Simulator, laboratory_of, relocated
 MODULE = '''
 """A lamp that a line of text switches, and that tells its current: `?` -> `I=0.25`, `on` and `off` -> `ok`."""
 
-import asyncio
 from typing import Literal
 
 from thermostand.drivers.devices.kinds import VerbNumber, DeviceKind, Verb
@@ -40,7 +39,8 @@ from thermostand.drivers.settings import Identity, Polled
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.addresses import ByteAddress
-from thermostand.foundation.readings import Reading
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.readings import Channel, Reading
 
 
 class Settings(Polled):
@@ -51,21 +51,25 @@ class Settings(Polled):
 
 class Lamp:
     def __init__(self, name, settings, clock):
-        self.name, self.identity, self._clock = name, None, clock
+        self.name, self.identity, self._clock, self._lane = name, None, clock, None
         self._client = LineClient.at(name, settings.address, SerialSettings(9600, 1), (1.0, 0.0))
 
     async def _ask(self, text):
         def whole(data):
             return data.decode() if data.endswith(b"\\n") else None
 
-        return (await asyncio.to_thread(self._client.query, text.encode() + b"\\n", whole)).strip()
+        return (await self._lane.call(self._client.query, text.encode() + b"\\n", whole)).strip()
 
     async def open(self):
+        self._lane = self._lane or Lane(self.name, self._clock)
         await self._ask("?")
         self.identity = Identity("Acme", "L1", "7", "")
 
     async def close(self):
-        await asyncio.to_thread(self._client.close)
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._client.close)
+            lane.close()
 
     async def read(self):
         current_A = float((await self._ask("?")).removeprefix("I="))
@@ -82,6 +86,7 @@ KIND = DeviceKind(
     name="lamp",
     settings=Settings,
     make=lambda name, settings, around: Lamp(name, settings, around.clock),
+    channels=(Channel("current", "A", "current"),),
     verbs=(
         Verb(
             "shine",

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 from tests.journals import read_lines
 from tests.nightly import by_night
 from tests.recording.damage import read_segment
+from tests.recording.declared import declared
 from tests.system.disk_faults import KINDS, kind_of, put_back, states, tree_of
 from tests.system.test_kill_recording import read_series
 from thermostand.foundation.clock import NS_PER_S, Boot, VirtualClock
@@ -88,7 +89,7 @@ async def recorded(directory, order, start_ns, each_second):
     """A run in `directory`, killed unless it trips; `each_second` is called after each."""
     name, clock, hub = directory.name, VirtualClock(start_ns), Hub()
     info = SessionInfo(name, "demo", "DA1234567", "M. Adamczyk", "0.1.0", "virtual", simulated=True)
-    devices = {"thermometers": "thermometers", "camera": "camera"}
+    devices = declared({"thermometers": "thermometers", "camera": "camera"})
     recorder = Recorder(directory, info, order.attachments(), devices, hub, clock, settings=SETTINGS)
     recorder.start()
     journal = Journal.create(directory)

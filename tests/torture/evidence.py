@@ -246,7 +246,7 @@ class Evidence:
             self.marks.append(Mark(time_ns, message.step_id, message.kind, message.state, parameters))
         elif topic.endswith("/meta"):
             self.metas.append((time_ns, message.step_id, message.flags))
-        elif topic == "/sensors/temperature":
+        elif topic == "/readings/thermometers":
             for described, value in message.ListFields():
                 if described.name.endswith("_degC"):
                     kind = message.DESCRIPTOR.fields_by_name[f"{described.name}_quality"]

@@ -25,6 +25,7 @@ from thermostand.drivers.settings import CameraSettings
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.document_faults import TAG
 from thermostand.foundation.errors import DeviceError, Unreachable
+from thermostand.foundation.readings import Channel
 
 LONGEST_EXPOSURE_S = 10.0
 _IP_MTU = 14  # linux/in.h
@@ -169,6 +170,7 @@ KIND = DeviceKind(
     name="camera",
     settings=CameraSettings,
     make=_make,
+    channels=(Channel("temperature", "degC", "temperature"),),
     section="cameras",
     rank=90,
     is_opened=False,  # when it has its supply

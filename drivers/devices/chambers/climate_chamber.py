@@ -17,7 +17,7 @@ import thermostand.drivers.devices.chambers
 from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, ChamberUnitSettings
 from thermostand.drivers.devices.checking import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
-from thermostand.drivers.devices.kinds import CONTROL, Around, DeviceKind
+from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, Around, DeviceKind
 from thermostand.drivers.devices.protocols import InForce
 from thermostand.drivers.settings import Identity, same_device
 from thermostand.foundation.calls import Lane, Result
@@ -271,6 +271,7 @@ KIND = DeviceKind(
     name="regulator",
     settings=ChamberUnitSettings,
     make=_make,
+    channels=CONTROLLED,
     section="climate_chamber",
     device="regulator",
     rank=20,

@@ -37,7 +37,7 @@ from thermostand.foundation.events import (
     PICTURES_LOST,
 )
 from thermostand.foundation.items import Event, Item, Original
-from thermostand.foundation.readings import Quality, Reading, bad_reading
+from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
 
 _SUFFIXES = (".jpg", ".jpeg")
 _LARGEST_BYTES = 20_000_000
@@ -191,8 +191,8 @@ class ThermalImager:
         )
 
     def _bad(self, reason: str, now_ns: int) -> tuple[Reading, ...]:
-        channels = [(spot, "degC") for spot in self._settings.spots] + [("clock_offset", "s")]
-        return tuple(bad_reading(f"{self.name}.{each}", unit, now_ns, reason) for each, unit in channels)
+        channels = _channels_of(self._settings)
+        return tuple(bad_reading(f"{self.name}.{each.name}", each.unit, now_ns, reason) for each in channels)
 
     def _begin(self, listed: dict[str, _Stamp]) -> None:
         self._files = {name: _Seen(stamp, 0, 0, settled=True) for name, stamp in listed.items()}
@@ -400,10 +400,16 @@ async def _check(look: DeviceLook) -> None:
     look.add(await asyncio.to_thread(imager_finding, look.settings))
 
 
+def _channels_of(settings: ThermalImagerSettings) -> tuple[Channel, ...]:
+    """Each spot, and how far its clock is off."""
+    return (*(Channel(spot, "degC", "temperature") for spot in settings.spots), Channel("clock_offset", "s", "time"))
+
+
 KIND = DeviceKind(
     name="imager",
     settings=ThermalImagerSettings,
     make=_make,
+    channels=lambda imager, of_section, map_of: _channels_of(imager),
     section="imager",
     device="imager",
     rank=60,

@@ -30,7 +30,7 @@ from thermostand.foundation.errors import (
     Superseded,
     Unreachable,
 )
-from thermostand.foundation.readings import Quality, Reading, bad_reading
+from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
 
 _VENDOR_POLOLU = 0x1FFB
 _PRODUCTS_JRK_G2 = {0x00B7: "18v27", 0x00B9: "24v21", 0x00BF: "18v19", 0x00C1: "24v13", 0x00C5: "21v3"}
@@ -465,6 +465,7 @@ KIND = DeviceKind(
     name="flap",
     settings=FlapSettings,
     make=_make,
+    channels=(Channel("position", "1", "position"), Channel("current", "mA", "current")),
     section="flap",
     device="flap",
     rank=70,

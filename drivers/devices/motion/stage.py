@@ -24,7 +24,7 @@ from thermostand.foundation.addresses import ByteAddress, stated
 from thermostand.foundation.calls import Lane, Result
 from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.errors import DeviceAlarm, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
-from thermostand.foundation.readings import Quality, Reading
+from thermostand.foundation.readings import Channel, Quality, Reading
 
 _LINE = SerialSettings(baud=115200, stopbits=2)
 _MICROSTEPS = 256
@@ -445,6 +445,11 @@ KIND = DeviceKind(
     name="axis",
     settings=AxisSettings,
     make=_make,
+    channels=lambda axis, of_section, map_of: (
+        Channel("position", axis.unit, "position"),
+        Channel("moving", "1", "flag"),
+        Channel("homed", "1", "flag"),
+    ),
     section="axes",
     rank=80,
     places=lambda axis: (LockedPlace("wire", axis.address), LockedPlace("number", f"stage {axis.serial_number}")),

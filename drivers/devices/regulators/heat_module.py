@@ -20,7 +20,7 @@ from thermostand.drivers.settings import Identity, OnBus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
 from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
-from thermostand.foundation.readings import Quality, Reading
+from thermostand.foundation.readings import Channel, Quality, Reading
 
 _TOLERANCE_mA = 0.1  # of what reads back: the modules are good to 0.02 mA
 _TOLERANCE_s = 0.05  # of its watchdog's time, which it keeps in tenths
@@ -354,6 +354,7 @@ KIND = DeviceKind(
     name="output",
     settings=HeatModuleSettings,
     make=_make,
+    channels=(Channel("output", "mA", "current"), Channel("tripped", "1", "flag")),
     section="heat_module",
     device="heat_module",
     rank=15,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from thermostand.drivers.devices.checking import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
-from thermostand.drivers.devices.kinds import CONTROL, Around, DeviceKind
+from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, Around, DeviceKind, MapOf, OfSection
 from thermostand.drivers.devices.protocols import InForce
 from thermostand.drivers.settings import Identity, OnBus
 from thermostand.drivers.wires.bus import Bus
@@ -12,11 +12,11 @@ from thermostand.drivers.wires.modbus_unit import CONFIRM_LOOKS, ModbusUnit, Sam
 from thermostand.drivers.wires.registers import RegisterMap
 from thermostand.foundation.clock import Clock, seconds_ns
 from thermostand.foundation.errors import ConfigError, DeviceFault, Occupied, Refused
-from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.foundation.readings import Channel, Reading, bad_reading
 
 PROBE_PERIOD_S = 30.0
 AUTOTUNE = "autotune"
-QUANTITIES = ("pv", "sp", "mv_heat", "mv_cool")
+_OUTPUTS = (Channel("mv_heat", "%", "output"), Channel("mv_cool", "%", "output"))
 
 
 class Regulator:
@@ -207,29 +207,35 @@ class Regulator:
             faults.append("set point changed at the unit")
         faults += self._objections(snapshot)
         running = is_confirmed(self._map.commands["run"], snapshot)
-        quantities = [name for name in QUANTITIES if name in snapshot.samples]
+        quantities = [each for each in (*CONTROLLED[:2], *_OUTPUTS) if each.name in snapshot.samples]
         return (
-            *(self._reading(name, snapshot.samples[name], now_ns) for name in quantities),
+            *(self._reading(each, snapshot.samples[each.name], now_ns) for each in quantities),
             Reading(f"{self.name}.running", float(running), "1", now_ns),
             Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason=", ".join(faults)),
         )
 
-    def _reading(self, quantity: str, sample: Sample, now_ns: int) -> Reading:
-        channel = f"{self.name}.{quantity}"
-        unit = "%" if quantity.startswith("mv_") else "degC"
+    def _reading(self, quantity: Channel, sample: Sample, now_ns: int) -> Reading:
+        channel = f"{self.name}.{quantity.name}"
         if sample.reason:
-            return bad_reading(channel, unit, now_ns, sample.reason)
-        return Reading(channel, sample.value, unit, now_ns)
+            return bad_reading(channel, quantity.unit, now_ns, sample.reason)
+        return Reading(channel, sample.value, quantity.unit, now_ns)
 
 
 def _make(name: str, settings: OnBus, around: Around) -> Regulator:
     return Regulator(name, around.bus, around.map_of("regulator", settings), around.clock)
 
 
+def _channels(settings: OnBus, of_section: OfSection, map_of: MapOf) -> tuple[Channel, ...]:
+    """What every controller tells, and the outputs that its map has."""
+    points = map_of("regulator", settings).points
+    return (*CONTROLLED, *(each for each in _OUTPUTS if each.name in points))
+
+
 KIND = DeviceKind(
     name="regulator",
     settings=OnBus,
     make=_make,
+    channels=_channels,
     section="regulator",
     device="regulator",
     rank=20,

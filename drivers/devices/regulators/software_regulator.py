@@ -16,7 +16,7 @@ from typing import Literal, cast
 from pydantic import Field
 
 from thermostand.drivers.devices.checking import DeviceLook
-from thermostand.drivers.devices.kinds import CONTROL, Arguments, Around, DeviceKind, Hands, Verb
+from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, Arguments, Around, DeviceKind, Hands, Verb
 from thermostand.drivers.devices.protocols import HeatOutput, InForce, Switches
 from thermostand.drivers.devices.regulators import pid, relay_tuning
 from thermostand.drivers.devices.regulators.heat_module import HeatModule
@@ -29,7 +29,7 @@ from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import DeviceError, DeviceFault, Occupied, Refused
 from thermostand.foundation.events import AUTOTUNED
 from thermostand.foundation.items import Item
-from thermostand.foundation.readings import Quality, Reading, bad_reading
+from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
 from thermostand.foundation.tasks import cancelled, failure_text
 
 _REST_K, _REST_S = 0.5, 600.0  # how near, and for how long, the set-point is held before it is tuned about
@@ -310,6 +310,7 @@ KIND = DeviceKind(
     name="regulator",
     settings=SoftwareRegulatorSettings,
     make=_make,
+    channels=(*CONTROLLED, Channel("mv_heat", "%", "output"), Channel("mv_cool", "%", "output")),
     section="regulator",
     device="regulator",
     rank=35,  # after the thermometers, of which it shows what was read

@@ -1,0 +1,33 @@
+"""What devices of the usual kinds are recorded to measure."""
+
+from collections.abc import Mapping
+
+from thermostand.foundation.readings import Channel
+from thermostand.recording.format.batches import BatchForm, RecordedDevice, batch_form
+
+PLACES = ("granite_inside", "granite_outside", "artifact", "air", "laboratory")
+_CHANNELS: Mapping[str, tuple[tuple[str, str], ...]] = {
+    "thermometers": (*((place, "degC") for place in PLACES), *((f"{place}_raw", "1") for place in PLACES)),
+    "regulator": (("pv", "degC"), ("sp", "degC"), ("running", "1"), ("fault", "1"), ("mv_heat", "%"), ("mv_cool", "%")),
+    "relays": tuple((name, "1") for name in ("heater_enable", "compressor", "camera_power")),
+    "camera": (("temperature", "degC"),),
+    "axis": (("position", "mm"), ("moving", "1"), ("homed", "1")),
+    "flap": (("position", "1"), ("current", "mA")),
+    "imager": (("lens", "degC"), ("housing", "degC"), ("back", "degC"), ("clock_offset", "s")),
+}
+KINDS = tuple(_CHANNELS)
+
+
+def declared(devices: Mapping[str, str]) -> dict[str, RecordedDevice]:
+    """Devices by their names, of kinds by their names; an axis named rotary is in degrees."""
+    return {name: _device(name, kind) for name, kind in devices.items()}
+
+
+def form(name: str, kind: str = "") -> BatchForm:
+    """How the readings of a device are recorded, which is named as its kind unless that is given."""
+    return batch_form(name, _device(name, kind or name))
+
+
+def _device(name: str, kind: str) -> RecordedDevice:
+    units = {"mm": "deg"} if name == "rotary" else {}
+    return RecordedDevice(kind, tuple(Channel(each, units.get(unit, unit)) for each, unit in _CHANNELS[kind]))
