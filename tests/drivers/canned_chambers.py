@@ -152,7 +152,8 @@ def texts(kind: Literal["hart", "vaisala"]) -> Parser:
         return {channel: None if isnan(value) else value for channel, value in values.items()}
 
     def answer(number: int, heard: bytes) -> Any:
-        found = probe._heard(heard)
+        told = probe._heard(heard)
+        found = None if told is None else {channel.name: value for channel, value in told.items()}
         return None if found is None else plain(found)
 
     def between(line: str, word: str, unit: str) -> float | str | None:
