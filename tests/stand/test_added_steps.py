@@ -84,9 +84,9 @@ def recipe(*entries: object) -> Recipe:
 def test_a_recipe_names_it_and_its_values_are_checked():
     (_, planned) = recipe({"start_chamber": 24.0}, {"lamp_on": 40.0}).plan()
     assert (planned.step.kind, planned.step.parameters) == ("lamp_on", {"percent": 40.0})
-    with pytest.raises(ConfigError, match=r"own.yaml: steps.1.lamp_on: must be less than or equal to 100"):
+    with pytest.raises(ConfigError, match=r"own.yaml: steps.1.lamp_on: must be .* 100$"):
         recipe({"lamp_on": 140.0})
-    with pytest.raises(ConfigError, match=r"own.yaml: steps.1: lamp_on needs a value behind its colon"):
+    with pytest.raises(ConfigError, match=r"own.yaml: steps.1: lamp_on needs"):
         recipe("lamp_on")
     with pytest.raises(ConfigError, match=r"no_lamp: acme-lamp 1.0 cannot be loaded .*; reinstall it"):
         recipe("no_lamp")
@@ -98,7 +98,7 @@ def test_it_has_its_words_its_price_its_form_and_its_limits():
     step = step_of("lamp_on", {"percent": 40.0})
     assert (step.words, words_of("lamp_on", {"percent": 40.0})) == ("lamp at 40 %", "lamp at 40 %")
     assert [each.duration_s for each in price(number_steps([step]), config)] == [4.0]
-    with pytest.raises(ConfigError, match=r"step 1 \(lamp_on\): the lamp stands too near the camera"):
+    with pytest.raises(ConfigError, match=r"step 1 \(lamp_on\): the lamp"):
         price(number_steps([step_of("lamp_on", {"percent": 95.0})]), config)
     assert cast("dict[str, Any]", schema_of_steps()["$defs"])["lamp_on"]["required"] == ["percent"]
     entry = Recipe.model_json_schema()["$defs"]["StepEntry"]["properties"]["lamp_on"]
@@ -111,7 +111,7 @@ def test_the_journal_keeps_it_and_a_plan_that_is_changed_has_it():
     change = edited(START_NS, 0, steps)
     assert decoded(encoded(change)) == change
     state = RunState(tuple(number_steps(steps)))
-    assert "sets up what later steps rely on" in refusal(state, Skipped(START_NS, state.plan[1].step_id))
+    assert "sets up" in refusal(state, Skipped(START_NS, state.plan[1].step_id))
 
 
 @pytest.mark.usefixtures("lamp")
@@ -139,7 +139,7 @@ def test_it_is_performed_recorded_and_restored_after_a_hold(tmp_path: Path):
 
 
 def test_a_kind_states_whether_it_sets_up():
-    with pytest.raises(TypeError, match="Half is a step and has to state is_setup"):
+    with pytest.raises(TypeError, match=r"Half .* is_setup"):
 
         @dataclass(frozen=True)
         class Half(Step):
@@ -149,7 +149,7 @@ def test_a_kind_states_whether_it_sets_up():
 
 
 def test_a_kind_is_one_word_as_recipes_write_it():
-    with pytest.raises(TypeError, match="its kind 'LampOff' has to be one word, as in move_to"):
+    with pytest.raises(TypeError, match="'LampOff' has to be one word"):
 
         @dataclass(frozen=True)
         class LampOff(Step):

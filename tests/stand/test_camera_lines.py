@@ -57,9 +57,9 @@ def test_three_cameras_of_5_MP_at_2_frames_a_second_fit_on_one_line():
 
 
 def test_what_the_line_does_not_carry_is_refused_before_the_night():
-    with pytest.raises(ConfigError, match=r"faster than the line of 1000 Mbit/s that 16 cameras share"):
+    with pytest.raises(ConfigError, match="1000 Mbit/s that 16 cameras"):
         price(parse_document(RECIPE, Recipe, "recipe").plan(), of(16))
-    with pytest.raises(ConfigError, match=r"faster than the line of 100 Mbit/s that 3 cameras share"):
+    with pytest.raises(ConfigError, match="100 Mbit/s that 3 cameras"):
         price(parse_document(RECIPE, Recipe, "recipe").plan(), of(3, line_Mbps=100))
     assert price(parse_document(RECIPE, Recipe, "recipe").plan(), of(3))
 
@@ -94,5 +94,5 @@ def test_a_capture_may_name_its_cameras_which_the_stand_has_to_have():
     assert [capture.cameras for capture in captures] == [("left",)]
     assert captures[0].parameters["cameras"] == ("left",)
     assert "cameras" not in replace(captures[0], cameras=()).parameters
-    with pytest.raises(ConfigError, match="this stand has no camera top; it has camera, left, right"):
+    with pytest.raises(ConfigError, match="no camera top; it has camera, left, right"):
         price(parse_document(CAPTURE_OF.format(name="top"), Recipe, "recipe").plan(), of(3))

@@ -94,5 +94,5 @@ async def test_whichever_has_restarted_is_reported(pair: tuple[Camera, Camera, C
 async def test_without_any_opening_is_refused_with_a_sentence():
     none = Cameras({})
     await none.close()
-    with pytest.raises(ConfigError, match="this stand has none; name it under cameras"):
+    with pytest.raises(ConfigError, match="name it under cameras"):
         await none.open()

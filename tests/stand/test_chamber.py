@@ -80,7 +80,7 @@ async def test_a_fault_between_set_point_and_permission_leaves_no_heat():
         starting = asyncio.create_task(here.stand.chamber.start(45.0))
         await here.passes(0.5)
         trip(here.stand, Fault("air_hot", "the air is too hot"))
-        with pytest.raises(StandTripped, match="the air is too hot"):
+        with pytest.raises(StandTripped, match="too hot"):
             await starting
         assert here.calls == ["regulator sp 45"]
         assert here.relays.on == set()
@@ -109,7 +109,7 @@ async def test_a_regulator_that_is_autotuned_is_waited_for_and_that_is_an_event(
 async def test_a_stopped_regulator_that_gives_heat_fails_the_dead_mans_test():
     async with rooms() as here:
         here.regulator.mv_heat = 12.0
-        with pytest.raises(DeviceFault, match="is stopped and yet gives 12 % heat"):
+        with pytest.raises(DeviceFault, match="gives 12 % heat"):
             await here.stand.chamber.test_dead_man()
         assert here.calls == []
 
@@ -156,7 +156,7 @@ async def test_a_set_point_on_its_way_goes_no_further_when_the_stand_trips():
         walking = asyncio.create_task(here.stand.chamber.start(60.0))
         await here.passes(45.0)
         trip(here.stand, Fault("air_hot", "the air is too hot"))
-        with pytest.raises(StandTripped, match="the air is too hot"):
+        with pytest.raises(StandTripped, match="too hot"):
             await walking
         assert max(set_points(here.calls)) <= 25.5
 
@@ -197,6 +197,6 @@ async def test_a_board_that_does_not_rearm_is_refused_also_when_commands_reach_i
             return (Reading(f"relays.{HEATER}", float(now_ns < until_ns), "1", now_ns),)
 
         here.relays.hold_on, here.relays.switch, here.relays.read = hold_on, switch, read
-        with pytest.raises(DeviceFault, match="does not start its time again"):
+        with pytest.raises(DeviceFault, match="does not start"):
             await here.stand.chamber.test_dead_man()
         assert here.kinds.count("dead_man_late") == 1

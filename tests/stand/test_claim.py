@@ -175,7 +175,7 @@ async def test_in_a_folder_of_its_group_nobody_else_takes_the_locks_of_a_real_st
                     pass
     assert list(folder.iterdir()) == []
     folder.chmod(0o2777)
-    with pytest.raises(SessionError, match="is not a folder that root has made"):
+    with pytest.raises(SessionError, match="root has made"):
         async with claimed(stand, tmp_path / "night"):
             pass
 
@@ -183,7 +183,7 @@ async def test_in_a_folder_of_its_group_nobody_else_takes_the_locks_of_a_real_st
 async def test_a_runtime_folder_that_cannot_be_used_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "thermostand").touch()
-    with pytest.raises(SessionError, match="set XDG_RUNTIME_DIR to a folder of this user"):
+    with pytest.raises(SessionError, match="set XDG_RUNTIME_DIR"):
         async with claimed(config(), tmp_path):
             pass
 

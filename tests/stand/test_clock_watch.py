@@ -96,7 +96,7 @@ def test_a_suspend_is_an_event_with_its_length_and_no_step():
     (event,) = watched.events
     assert (event.level, event.kind) == ("warning", HOST_SUSPENDED)
     assert event.data == {"length_s": 40.0, "seen_ns": begin_ns, "stand_ns": begin_ns + seconds_ns(41)}
-    assert event.text == "the host was suspended for 40.0 s: nothing was watched or recorded meanwhile"
+    assert "suspended for 40.0 s" in event.text
 
 
 def step_event(time_s: float, before_s: float, after_s: float) -> Event:

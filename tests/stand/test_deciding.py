@@ -149,8 +149,8 @@ def test_without_decisions_the_fixed_plan_goes_on_and_it_is_said(life: Callable[
     assert here.run.done()
     assert [degC for degC, _ in captured(here.log.state.plan)] == [24.0, 47.0, *CYCLE.set_points_degC]
     texts = [item.text for item in here.reported if isinstance(item, Event) and item.kind == "undecided"]
-    assert texts[0] == "the process that fits the drift model has ended; the fixed plan goes on"
-    assert texts[1] == "too few frames; the fixed plan goes on"
+    assert "process that fits" in texts[0]
+    assert "too few frames" in texts[1]
 
 
 async def test_a_late_decision_is_not_waited_for(tmp_path: Path):
@@ -158,7 +158,7 @@ async def test_a_late_decision_is_not_waited_for(tmp_path: Path):
     decider = Decider(tmp_path, WallClock(), decided)
     found = await decider.decide(replace(DECIDE, wait_s=0.5))
     assert isinstance(found.answer, Undecided)
-    assert found.reason == "the drift model was not fitted within 0.5 s"
+    assert "within 0.5 s" in found.reason
 
 
 def total_s(steps: tuple[Step, ...]) -> float:

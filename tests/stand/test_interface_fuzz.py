@@ -135,4 +135,4 @@ async def test_what_fails_is_answered_with_a_sentence_published_as_an_event_and_
             assert (status, "ZeroDivisionError" in json.loads(text)["error"]) == (500, True)
         assert (await asyncio.to_thread(answered, port, "GET", "/healthz", "", {}, b""))[0] == 200
         await asyncio.sleep(0)
-    assert len([text for text in events if "nobody has thought of it" in text]) == 1
+    assert len([text for text in events if "nobody has thought" in text]) == 1

@@ -29,10 +29,10 @@ def test_nothing_may_move_while_a_run_is_ended_or_something_is_latched_and_a_pau
     gate.hold(OPERATOR)
     interlock.check()
     latch.trip(Fault("air_hot", "the air is too hot"))
-    with pytest.raises(Interlocked, match="the air is too hot"):
+    with pytest.raises(Interlocked, match="too hot"):
         interlock.check()
     gate.hold(STOPPING)
-    with pytest.raises(StandTripped, match="the air is too hot") as ended:
+    with pytest.raises(StandTripped, match="too hot") as ended:
         interlock.check()
     assert not isinstance(ended.value, Interlocked)  # which a step would wait for
     gate.clear(STOPPING)

@@ -184,7 +184,7 @@ def test_a_device_that_reports_a_fault_is_believed():
     reported = Reading("regulator.fault", 1.0, "1", 0, reason="set point changed at the unit")
     fault = rule(hub_of(reported), 0)
     assert fault is not None
-    assert fault.text == "regulator.fault: set point changed at the unit"
+    assert "set point changed" in fault.text
 
 
 @pytest.mark.parametrize(

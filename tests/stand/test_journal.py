@@ -147,7 +147,7 @@ def test_a_second_damage_is_kept_aside_as_well(tmp_path):
     journal, found = Journal.open(tmp_path)
     asyncio.run(write(journal))
     assert found == [ENTRIES[0], ENTRIES[2], *ENTRIES[4:]]
-    assert "line 2 and 1 more of 10 are damaged; the lines after it count" in journal.damage
+    assert "line 2 and 1 more of 10 are damaged" in journal.damage
     assert (tmp_path / "journal.jsonl.damaged").read_bytes() == first
     assert (tmp_path / "journal.jsonl.2.damaged").read_bytes() == second
 
@@ -175,24 +175,24 @@ def test_a_torn_tail_is_cut_off_and_the_journal_goes_on_behind_the_last_whole_li
 
 def test_a_journal_that_is_open_is_refused_to_a_second_daemon(tmp_path):
     journal = Journal.create(tmp_path)
-    with pytest.raises(SessionError, match="a daemon is running this session already"):
+    with pytest.raises(SessionError, match="is running this session"):
         Journal.open(tmp_path)
     asyncio.run(journal.close())
     assert on_disk(tmp_path) == []
 
 
 def test_no_journal_and_a_second_one_are_refused_with_a_sentence(tmp_path):
-    with pytest.raises(SessionError, match=r"has no journal of a run \(.*\); begin a new run"):
+    with pytest.raises(SessionError, match=r"no journal of .*\("):
         Journal.open(tmp_path)
     new_journal(tmp_path)
-    with pytest.raises(SessionError, match="no journal can be begun here"):
+    with pytest.raises(SessionError, match="no journal can"):
         Journal.create(tmp_path)
 
 
 @pytest.mark.parametrize("line", [b'{"entry": "Teleported", "time_ns": 1}', b'{"entry": "Gap", "to": 1}', b"[]", b"x"])
 def test_a_whole_line_of_another_version_is_refused_with_a_sentence(tmp_path, line):
     (tmp_path / JOURNAL_NAME).write_bytes(journal_lines([line], MARK))
-    with pytest.raises(SessionError, match="of another version of thermostand"):
+    with pytest.raises(SessionError, match="another version"):
         Journal.open(tmp_path)
     (tmp_path / JOURNAL_NAME).unlink()
     new_journal(tmp_path)  # nothing stays locked or open
@@ -344,13 +344,13 @@ def test_a_journal_that_somebody_else_has_is_not_taken_over_and_nothing_stays_op
 
 def test_a_pipe_in_its_place_is_refused_and_not_waited_for(tmp_path: Path):
     os.mkfifo(tmp_path / JOURNAL_NAME)
-    with pytest.raises(SessionError, match=r"journal\.jsonl: is no file, so no journal; begin a new run"):
+    with pytest.raises(SessionError, match=r"journal\.jsonl: is no file"):
         Journal.open(tmp_path)
 
 
 def test_an_entry_nested_deeper_than_anything_is_of_another_version():
     text = b"[" * 100_000
-    with pytest.raises(SessionError, match="an entry is of another version"):
+    with pytest.raises(SessionError, match="another version"):
         read_lines(b"%08x %s\n" % (zlib.crc32(text), text))
 
 

@@ -1,10 +1,12 @@
 """A virtual run and its simulator share one CPU, and give the others back."""
 
+import multiprocessing
 import os
 import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -58,18 +60,22 @@ with one_cpu.one_cpu():
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="there is one CPU only")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of threads that have ended
 def test_runs_side_by_side_take_different_cpus_and_a_killed_one_gives_its_own_back(tmp_path: Path):
     """Whatever the numbers of their processes: as many at once as there are CPUs, and as many again."""
     usable = os.sched_getaffinity(0)
     for cpu in usable:
         (tmp_path / f"cpu{cpu}").mkdir()
-    command = [sys.executable, "-c", HOLD, str(tmp_path / "cpu{}")]
+    fork = multiprocessing.get_context("fork")
     for _ in range(2):
-        runs = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in usable]
-        taken = {run.stdout.readline() for run in runs if run.stdout is not None}
-        for run in runs:
-            run.kill()
-            run.communicate()
+        heard, told = fork.Pipe(duplex=False)
+        runs = [fork.Process(target=hold, args=(tmp_path, told)) for _ in usable]
+        for each in runs:
+            each.start()
+        taken = set[int]().union(*(heard.recv() for _ in usable))
+        for each in runs:
+            each.kill()
+            each.join()
         assert len(taken) == len(usable)
 
 

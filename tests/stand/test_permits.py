@@ -352,7 +352,7 @@ async def test_a_computer_that_is_held_up_in_each_test_of_the_timer_says_so_and_
             await hold_on(channel, duration_s)
 
         bench.board.hold_on = late
-        with pytest.raises(DeviceFault, match="held up in each of the tests"):
+        with pytest.raises(DeviceFault, match="held up in each"):
             await bench.permits.test_dead_man(is_timed=False)
         assert [(event.kind, event.data["test"]) for event in bench.events] == [
             ("dead_man_late", number) for number in range(1, 6)

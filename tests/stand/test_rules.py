@@ -119,7 +119,7 @@ def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_pat
     found = table.first_s(4000)
     assert found is not None
     assert (found[0], found[1].rule, found[1].action) == (900, "disk_low", "hold")
-    assert "frames are not recorded any more" in found[1].text
+    assert "frames are not recorded" in found[1].text
     table.hub.publish(Event(0, "info", "frames_resumed", "frames are recorded again"))
     assert table.look(5000) == []
 

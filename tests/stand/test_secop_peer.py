@@ -68,7 +68,7 @@ def converse(port: int, desk: SecopDesk, on_loop: Callable[[Callable[[], object]
         assert peer.execCommand("run", "submit", "overnight")[0] == 1
         peer.execCommand("run", "stop")
         desk.phase = "running"
-        with pytest.raises(errors.IsBusyError, match="a run has the stand"):
+        with pytest.raises(errors.IsBusyError, match="has the stand"):
             peer.setParameter("linear", "target", 3.0)
     finally:
         peer.disconnect()

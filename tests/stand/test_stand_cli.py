@@ -33,8 +33,8 @@ def test_plan_lists_steps_and_totals():
     result = runner.invoke(app, ["plan", "thermal-cycle"])
     assert result.exit_code == 0
     assert "set_temperature chamber_degC=31.0" in " ".join(result.output.split())
-    assert "GB; started now it ends" in result.output
-    assert "49 looks at the drift: a step of the image from 50 mpx on shows" in result.output
+    assert "started now" in result.output
+    assert "step of the image from 50 mpx" in result.output
 
 
 def test_the_json_plan_adds_up():

@@ -97,7 +97,7 @@ def test_a_disk_that_hangs_keeps_the_guard_waiting_for_a_moment_only(path: Path)
     latch, hanging = LatchFile([path]), threading.Event()
     latch.run = lambda *_: hanging.wait()
     assert WITHIN_S <= 0.25
-    assert latch.keep(FAULT, 5) == "the disk has not answered"
+    assert "not answered" in latch.keep(FAULT, 5)
     hanging.set()
 
 

@@ -158,7 +158,7 @@ async def test_a_control_loop_that_hangs_is_said_to_and_orders_time_out():
     async def never(_: object) -> None:
         await asyncio.Event().wait()
 
-    with pytest.raises(NoAnswer, match=r"has not answered within 0\.05 s; it may still do"):
+    with pytest.raises(NoAnswer, match=r"within 0\.05 s"):
         await bridge.ask(never, 0.05)
     bridge.close()
     with pytest.raises(NoAnswer, match="the daemon is ending"):

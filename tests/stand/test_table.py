@@ -44,7 +44,7 @@ async def test_a_fault_while_a_stage_homes_keeps_it_from_the_move():
 
 async def test_an_axis_that_the_stand_has_not_is_named_with_those_it_has():
     async with rooms() as here:
-        with pytest.raises(ConfigError, match="the plan moves axis rotary, but this stand has linear"):
+        with pytest.raises(ConfigError, match=r"axis rotary, .* has linear$"):
             await here.stand.table.move_to("rotary", 1.0)
 
 

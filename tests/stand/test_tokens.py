@@ -72,7 +72,7 @@ def test_what_is_wrong_in_the_file_is_said_without_a_word_of_it(tmp_path: Path, 
     path = tmp_path / "tokens.yaml"
     path.write_text(content)
     path.chmod(0o600)
-    with pytest.raises(ConfigError, match="is not as it should be") as raised:
+    with pytest.raises(ConfigError, match="as it should be") as raised:
         load_tokens(path)
     assert TOKEN[:5] not in str(raised.value)
 
@@ -82,5 +82,5 @@ def test_a_file_that_others_may_read_is_refused(tmp_path: Path):
     write_tokens(path, TokenFile(tokens={"rose": TOKEN}))
     assert load_tokens(path) == TokenFile(tokens={"rose": TOKEN})
     path.chmod(0o640)
-    with pytest.raises(ConfigError, match="others may read or write it"):
+    with pytest.raises(ConfigError, match="others may read"):
         load_tokens(path)

@@ -83,6 +83,7 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
     polled and guarded calmly, but in files that ask for another `POLLED`: those of the guard and the relays, whose
     subject is time. By night all have the whole sensor and are polled as installed.
     """
+    require_aravis()
     by_day = request.node.get_closest_marker("nightly") is None
     frame, polled = (CORNER, getattr(request.module, "POLLED", CALM)) if by_day else (WHOLE_SENSOR, AS_INSTALLED)
 
@@ -140,7 +141,6 @@ def simulator() -> Iterator[Callable[[StandConfig, bool], Simulator]]:
 @pytest.fixture
 def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Callable[..., object]) -> Path:
     """The configuration of a simulated stand that answers, with a guard that looks often."""
-    require_aravis()
     data: Any = yaml_data(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}), "laboratory")
     data["relays"]["self_test_s"] = 1.0
     data["cameras"]["camera"] |= {"boot_s": 0.5, "poll_s": 1.0}

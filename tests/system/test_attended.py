@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests import forked
-from tests.system.conftest import require_aravis
 from thermostand.recording.reading.session import Session
 
 PROMPTED = """
@@ -35,7 +34,6 @@ def asked(daemon: subprocess.Popen[str]) -> None:
 
 
 def test_an_attended_run_waits_at_its_prompt_also_when_it_is_resumed(tmp_path: Path, config_text: Callable[..., str]):
-    require_aravis()
     config, recipe, out = tmp_path / "stand.yaml", tmp_path / "recipe.yaml", tmp_path / "out"
     config.write_text(config_text())
     recipe.write_text(PROMPTED)

@@ -8,7 +8,7 @@ import pytest
 
 from tests.asking import ask, ask_status
 from tests.nightly import by_night
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import SHORT_RECIPE
 from tests.system.test_guard_run import Watcher, check_safe
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import break_now
@@ -16,11 +16,6 @@ from thermostand.foundation.hub import Hub
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 async def operated(run: Coroutine[None, None, Path], operate: Coroutine[None, None, None]) -> Path:

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import SHORT_RECIPE
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import break_now
 from thermostand.foundation.items import Batch
@@ -14,11 +13,6 @@ from thermostand.foundation.readings import Quality
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 async def test_a_frozen_camera_temperature_is_stale_in_the_recording(tmp_path: Path, order: Callable[..., Order]):

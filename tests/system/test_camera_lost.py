@@ -48,7 +48,7 @@ async def test_without_resend_a_frame_with_holes_is_never_used(plant: StillPlant
         fake.faults.no_resend = True
         async with opened(clock, packet_size=1500) as camera:
             fake.faults.loss = 0.05
-            with pytest.raises(Unreachable, match="3 software triggers brought no complete frame"):
+            with pytest.raises(Unreachable, match="3 software triggers"):
                 await camera.grab()
             assert sum(count for name, count in camera.counters().items() if name.startswith("incomplete_")) == 3
             fake.faults.loss = 0.0
@@ -62,7 +62,7 @@ async def test_three_missing_frames_of_a_free_run_are_a_lost_camera(plant: Still
     async with virtual(plant) as (clock, fake), opened(clock, trigger="free_run", frame_rate_hz=2) as camera:
         await camera.grab()
         fake.faults.silent_gvsp = True
-        with pytest.raises(Unreachable, match="3 frame periods brought no complete frame"):
+        with pytest.raises(Unreachable, match="3 frame periods"):
             await camera.grab()
         with pytest.raises(Unreachable, match="3 frame periods"):  # until it is opened again
             await camera.read()
@@ -174,7 +174,7 @@ async def test_a_camera_that_froze_past_its_heartbeat_is_lost_and_comes_back(fak
 async def test_while_another_client_controls_the_camera_open_is_refused():
     async with opened():
         other = Camera("other", settings(), WallClock())
-        with pytest.raises(Refused, match="another client controls the camera"):
+        with pytest.raises(Refused, match="another client controls"):
             await other.open()
         await other.close()
 

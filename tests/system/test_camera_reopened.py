@@ -8,17 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.system.conftest import FAST, require_aravis
+from tests.system.conftest import FAST
 from tests.system.test_run import fault
 from tests.system.test_unrecorded_heat import SOAK, happens, heating
 from thermostand.foundation.items import Batch
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 def temperatures_good(directory: Path) -> list[bool]:

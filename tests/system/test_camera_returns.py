@@ -3,9 +3,6 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
-from tests.system.conftest import require_aravis
 from tests.system.test_run_ends import SHORTER, break_now
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
@@ -14,11 +11,6 @@ from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_has_one(

@@ -6,10 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from tests.journals import read_lines
-from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher
 from tests.system.test_guard_wire import write_by_another_master
@@ -34,11 +32,6 @@ experiments:
       frames_per_point: 1
 """
 CAMERA_RELAY = 2
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 def check_soaked(session: Session, since_ns: int) -> None:

@@ -190,7 +190,7 @@ async def test_a_broken_temperature_is_bad_and_the_frames_go_on(fake: FakeCamera
 
 async def test_a_camera_that_would_free_itself_between_two_requests_is_refused(fake: FakeCamera):
     fake.faults.heartbeat_most_ms = 600
-    with pytest.raises(Refused, match=r"a heartbeat of 1\.5 s was asked for, the camera took 0\.6 s"):
+    with pytest.raises(Refused, match=r"1\.5 s was asked .* 0\.6 s"):
         async with opened():
             pass
     fake.faults.heartbeat_most_ms = 1300

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.asking import ask
-from tests.system.conftest import AS_INSTALLED, require_aravis
+from tests.system.conftest import AS_INSTALLED
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher
 from tests.system.test_resume import end_laboratory
@@ -34,11 +34,6 @@ name: warm
 experiments:
   - warm_up: {table_position: {linear: 10, rotary: 0}, frames: 8, interval_s: 30, band_K: 2}
 """
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 def test_a_warm_up_that_was_killed_begins_again_from_a_cold_camera(tmp_path: Path, order: Callable[..., Order]):

@@ -119,11 +119,11 @@ def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(s
     assert not idle.heater_permitted
     served.submit(BRIEF, "one")
     served.submit(BRIEF, "one")  # asked again: the same
-    with pytest.raises(SessionError, match="a tag is one word"):
+    with pytest.raises(SessionError, match="one word"):
         served.submit(BRIEF, "three", tags=["two words"])
     second = served.submit(BRIEF.replace("name: brief", "name: other"), "two", note="a new lens", tags=["lens-b"])
     running = served.until(lambda state: state.run is not None and bool(state.queue[0].session))
-    with pytest.raises(SessionError, match="a run has the stand"):
+    with pytest.raises(SessionError, match="has the stand"):
         served.post("devices/flap/open")
     with pytest.raises(SessionError, match="another one"):
         served.submit(LONG, "two")
@@ -134,7 +134,7 @@ def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(s
     served.post(f"sessions/{done.queue[1].session}/notes", text="all well", tags=["good"])
     said = read_notes(served.out / done.queue[1].session)
     assert ([note.text for note in said.notes], said.tags) == (["a new lens", "all well"], ("lens-b", "good"))
-    with pytest.raises(SessionError, match="there is no session of that name"):
+    with pytest.raises(SessionError, match="no session of that"):
         served.post("sessions/no-such/notes", text="x")
     assert not done.heater_permitted
     served.post("devices/flap/open")
@@ -320,7 +320,7 @@ def test_a_second_daemon_and_a_second_run_touch_nothing(serve: Callable[[], Serv
     second = Served(laboratory, tmp_path / "other")
     reported = second.reported()
     assert second.process.returncode == 1
-    assert "in use by the daemon of `stand serve`" in reported
+    assert "daemon of `stand serve`" in reported
     assert served.state().fault is None
 
 
@@ -415,7 +415,7 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
             del left
             telling.cancel()
             await daemon.record.end()
-            with pytest.raises(Conflict, match="no heat without a recording"):
+            with pytest.raises(Conflict, match="without a recording"):
                 await desk.device(who, DeviceRequest(device="regulator", verb="set", arguments={"setpoint_degC": 30.0}))
             assert not desk.state().heater_permitted
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from tests.journals import read_lines
-from tests.system.conftest import require_aravis
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, fault, ignore
@@ -28,11 +27,6 @@ from thermostand.stand.running.memory.entries import Tripped
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 def flip(directory: Path, *numbers: int) -> int:

@@ -4,9 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
-from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.conftest import WHOLE_SENSOR
 from tests.system.test_run_ends import break_now
 from thermostand.compensation.observations import observe
 from thermostand.foundation.hub import Hub
@@ -30,11 +28,6 @@ experiments:
       reference_frames: 1
       frames_per_point: 1
 """
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 async def test_frames_of_a_camera_that_is_wrong_at_each_capture_say_so(tmp_path: Path, order: Callable[..., Order]):

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.system.conftest import require_aravis
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import evaluate
@@ -28,7 +27,7 @@ from thermostand.foundation.readings import Frame
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
-pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
+pytestmark = pytest.mark.nightly
 
 Seen = tuple[Observations, NDArray[np.float64]]
 
@@ -63,11 +62,6 @@ OF_PAPERS_FORM = 0.2  # at most so much of what the paper's form leaves
 # one camera share their errors, so of intervals that are right most nights hold more than 98 %, and some far fewer than
 # 92. Measured: 1.5 and 1.4, with 99.7 and 99.6 % held. `make bench` shows the coverage over many cameras.
 WIDEST = 2.0
-
-
-@pytest.fixture
-def _aravis() -> None:
-    require_aravis()
 
 
 async def record(order: Order, out: Path) -> Seen:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.conftest import CORNER, SHORT_RECIPE, require_aravis
+from tests.system.conftest import CORNER, SHORT_RECIPE
 from thermostand.experiments.steps import Soak
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.hub import Hub
@@ -20,13 +20,6 @@ from thermostand.stand.estimating.learned import learn, load_learned
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
-
-pytestmark = pytest.mark.usefixtures("_aravis")
-
-
-@pytest.fixture
-def _aravis() -> None:
-    require_aravis()
 
 
 def fed(eta: Eta) -> Callable[[Item], None]:

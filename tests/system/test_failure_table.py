@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests.nightly import by_night
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import SHORT_RECIPE
 from tests.system.simulated_orders import simulated_order
 from thermostand.drivers.wires import camera_connection
 from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
@@ -101,11 +101,6 @@ CAMERA_LOST = (
     "camera.control_lost",
     by_night("camera.power"),
 )
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.conftest import AS_INSTALLED, require_aravis
+from tests.system.conftest import AS_INSTALLED
 from tests.system.test_run import at_step
 from tests.system.test_run_ends import SHORTER, break_now
 from thermostand.foundation.errors import StandTripped
@@ -19,11 +19,6 @@ from thermostand.stand.service.run import run_virtual
 POLLED = AS_INSTALLED
 
 QUICK = {"timeout_s": 0.05}
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 def bad_polls_ns(session: Session, channel: str, cause: str) -> list[int]:

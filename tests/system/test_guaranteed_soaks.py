@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.conftest import WHOLE_SENSOR
 from tests.system.test_step_faults import Operator, run_with
 from thermostand.compensation.observations import observe
 from thermostand.foundation.events import SOAK_LONGER
@@ -38,11 +38,6 @@ steps:
   - stop_chamber
 """
 BAND_K = 1.0
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 def unwatched(hub: Hub) -> None:

@@ -14,7 +14,6 @@ import pytest
 from tests.asking import ask_status
 from tests.recording.disks import ext4, run
 from tests.stand.test_listening import STATE, connected
-from tests.system.conftest import require_aravis
 from tests.system.test_run import fault
 from tests.system.test_unrecorded_heat import heater_is
 from thermostand.foundation.clock import NS_PER_S, WallClock
@@ -34,11 +33,6 @@ LIMIT_S = 240.0
 # A reading is up to 5 s old when the bus goes, and trips at 15 s.
 HANGS_S, GONE_S = 95.0, 5.0
 CLIENTS, BUSY = 64, 2
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 @contextmanager
@@ -127,8 +121,8 @@ async def test_the_guard_looks_on_and_a_stop_leaves_while_everything_hangs(
             process.wait(LIMIT_S)
             process.stderr.close()
     assert status == 130, said
-    assert "stopped by the operator; the stand is safe" in said
-    assert "is not on the disk yet, limit 60 s" in said
+    assert "stopped by the operator" in said
+    assert "limit 60 s" in said
     assert "the guard has not looked for" not in said  # what is reported when two looks are more than two periods apart
     assert sum(answers) > CLIENTS
     assert (safe_ns - begun_ns) / NS_PER_S < 15.0

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE, require_aravis
+from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE
 from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
@@ -356,18 +356,12 @@ async def test_a_daemon_whose_event_loop_is_held_up_does_not_heat(order: Callabl
         await bench.make_safe()
 
 
-@pytest.fixture
-def _aravis() -> None:
-    require_aravis()
-
-
 NIGHTS = [
     pytest.param(SHORT_RECIPE.replace("600", "300"), id="short"),
     pytest.param(packaged("recipes", "demo").read_text(), id="demo", marks=pytest.mark.nightly),
 ]
 
 
-@pytest.mark.usefixtures("_aravis")
 @pytest.mark.parametrize("recipe", NIGHTS)
 async def test_a_good_night_trips_nothing_and_warns_of_nothing(
     tmp_path: Path, order: Callable[..., Order], recipe: str

@@ -8,7 +8,6 @@ import cv2
 import pytest
 from typer.testing import CliRunner, Result
 
-from tests.system.conftest import require_aravis
 from tests.system.test_check import laboratory
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import load_config
@@ -18,7 +17,6 @@ from thermostand.stand.simulator import Simulator
 
 @pytest.fixture
 def tell(tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., Simulator]) -> Callable[..., Result]:
-    require_aravis()
     order(camera={"boot_s": 0.2, "serial_number": "TS-0001"}, recording={"directory": str(tmp_path / "none")})
     config = tmp_path / "config.yaml"
     simulator(load_config(config), False)

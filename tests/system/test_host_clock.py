@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.system.conftest import FAST, require_aravis
+from tests.system.conftest import FAST
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.events import CLOCK_STEP
@@ -41,11 +41,6 @@ name: brief
 steps: [start_chamber: 26, soak: 1.5, stop_chamber]
 """
 LIMIT_S = 90.0  # of real time for what should take a few seconds
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 class MovedTime:

@@ -10,7 +10,6 @@ import pytest
 
 from tests.asking import ask
 from tests.recording.disks import limit_files
-from tests.system.conftest import require_aravis
 from tests.system.test_run import fault
 from thermostand.experiments.steps import Capture
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
@@ -33,11 +32,6 @@ experiments:
       interval_s: 7
 """
 FRAMES, INTERRUPTED_AFTER = 12, 3
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 Action = Callable[[], Awaitable[object]]

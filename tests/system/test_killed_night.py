@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.journals import read_lines
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import SHORT_RECIPE
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import check, check_soaks, revived
 from thermostand.stand.running.memory.entries import Ended, Gap, Written
@@ -28,7 +28,6 @@ NIGHT = (
 def test_a_night_killed_every_20_s_of_real_time_comes_to_its_end_and_loses_nothing(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    require_aravis()
     ordered, out, rng = order(NIGHT), tmp_path / "out", random.Random(20)
     acknowledged, unresumed, lives = list[int](), 0, 1
     daemon = Daemon(ordered, out)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.journals import read_lines
-from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.conftest import WHOLE_SENSOR
 from thermostand.experiments.known import Visit
 from thermostand.experiments.steps import Capture, Decide
 from thermostand.foundation.clock import WallClock
@@ -39,7 +39,6 @@ async def test_a_night_decides_from_what_it_has_recorded_and_the_same_from_the_s
     tmp_path: Path, order: Callable[..., Order]
 ):
     """The first visits go where nothing is known yet, and later ones by the fitted model; it is never content."""
-    require_aravis()
     given = order(RECIPE, camera=WHOLE_SENSOR)
     session = Session.open(await run_virtual(given, tmp_path, 3, lambda _: None))
     entries, _ = read_lines((session.path / "journal.jsonl").read_bytes())

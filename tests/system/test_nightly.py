@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.conftest import require_aravis
 from thermostand.compensation.drift.evaluation import Evaluation
 from thermostand.compensation.reporting.report import analyse
 from thermostand.foundation.progress import progress
@@ -16,18 +15,13 @@ from thermostand.stand.config.stand_config import packaged
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
-pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
+pytestmark = pytest.mark.nightly
 
 # Between the two cameras, px: before compensation the modified one stays below these RMS along I and J, the unmodified
 # one above: (0.227, 0.630) and (0.395, 1.128). After it the modified one stays below AFTER_PX, the unmodified one below
 # its larger part.
 BEFORE_PX = (0.31, 0.88)
 AFTER_PX = (0.02, 0.1)
-
-
-@pytest.fixture
-def _aravis() -> None:
-    require_aravis()
 
 
 async def night(ordered: Order, out: Path) -> Path:

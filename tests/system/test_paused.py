@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from tests.asking import ask
-from tests.system.conftest import require_aravis
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of
 from thermostand.recording.reading.session import Session
@@ -54,7 +53,6 @@ async def test_the_answer_to_a_pause_says_what_still_moves(order: Callable[..., 
 
 
 async def test_a_pause_that_lasts_too_long_is_made_safe_and_held(tmp_path: Path, order: Callable[..., Order]):
-    require_aravis()
     ordered, out, watcher = order(LONG_SOAK, guard={"pause_limit_h": 0.25}), tmp_path / "out", Watcher()
     reasons: list[object] = []
 

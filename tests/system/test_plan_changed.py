@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.asking import ask
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import SHORT_RECIPE
 from thermostand.experiments.steps import Capture, CloseFlap, OpenFlap, Role, SetTemperature, Soak, StopChamber
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
@@ -23,11 +23,6 @@ from thermostand.stand.running.resume import interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 @pytest.fixture
@@ -59,7 +54,7 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
         await executor.extend(soak.step_id, 60.0)
         with pytest.raises(ConfigError, match=r"step 10: a set-point of 99 degC"):
             await executor.edit(9, [SetTemperature(99.0)])
-        with pytest.raises(ConfigError, match=r"step 11: the flap is closed here, and fit frames show the target"):
+        with pytest.raises(ConfigError, match="step 11: the flap"):
             await executor.edit(9, [SetTemperature(24.0), rest[1]])
         await executor.edit(other.index + 1, rest)
         (directory,) = out.iterdir()

@@ -50,11 +50,6 @@ steps:
 """
 
 
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
-
-
 def ignore(hub: Hub) -> None:
     pass
 

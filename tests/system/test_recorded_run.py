@@ -5,9 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.conftest import WHOLE_SENSOR
 from thermostand.compensation.observations import observe_session, session_target
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
@@ -27,11 +26,6 @@ experiments:
       reference_frames: 3
       frames_per_point: 2
 """
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 async def test_roi_keeps_the_markers_and_a_whole_frame_of_each_capture(tmp_path: Path, order: Callable[..., Order]):

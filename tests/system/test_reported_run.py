@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from tests import forked
-from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.conftest import WHOLE_SENSOR
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.foundation.exit_codes import NOT_REPORTED
 from thermostand.recording.reading.scan import verify
@@ -86,11 +86,6 @@ steps:
 
 
 @pytest.fixture
-def _aravis(compiled_fit: None) -> None:
-    require_aravis()
-
-
-@pytest.fixture
 def out(tmp_path: Path) -> Iterator[Path]:
     """A folder for sessions that is not kept: a night is large."""
     yield tmp_path / "sessions"
@@ -127,7 +122,7 @@ def check_reported(ended: subprocess.CompletedProcess[str]) -> Path:
     return directory
 
 
-@pytest.mark.usefixtures("_aravis")
+@pytest.mark.usefixtures("compiled_fit")
 @pytest.mark.parametrize(
     ("text", "frames"),
     [
@@ -142,7 +137,7 @@ def test_one_command_runs_a_recipe_to_a_report(out: Path, config_text: Callable[
     assert Session.open(directory).frame_count == frames
 
 
-@pytest.mark.usefixtures("_aravis")
+@pytest.mark.usefixtures("compiled_fit")
 def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, config_text: Callable[..., str]):
     ended = run_here(TOO_FEW_TEMPERATURES, config_text(camera=WHOLE_SENSOR), out)
     assert ended.exit_code == NOT_REPORTED
@@ -155,7 +150,7 @@ def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, conf
     assert not (directory / MODEL_NAME).exists()
 
 
-@pytest.mark.usefixtures("_aravis")
+@pytest.mark.usefixtures("compiled_fit")
 def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, config_text: Callable[..., str]):
     ended = run_here(WARM_UP_ALONE, config_text(camera=WHOLE_SENSOR), out)
     assert ended.exit_code == 0, ended.stderr
@@ -165,7 +160,7 @@ def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, confi
     assert ">Warm-up<" in (Path(session) / REPORT_NAME).read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("_aravis")
+@pytest.mark.usefixtures("compiled_fit")
 def test_frames_of_ones_own_steps_have_a_report_of_what_there_is(out: Path, config_text: Callable[..., str]):
     ended = run_here(OWN_STEPS, config_text(camera=WHOLE_SENSOR), out)
     assert ended.exit_code == 0, ended.stderr
@@ -178,7 +173,7 @@ def test_frames_of_ones_own_steps_have_a_report_of_what_there_is(out: Path, conf
 
 
 @pytest.mark.nightly
-@pytest.mark.usefixtures("_aravis")
+@pytest.mark.usefixtures("compiled_fit")
 def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_text: Callable[..., str]):
     text = config_text(recording={"frame_encoding": "roi"})
     directory = check_reported(run_reported("overnight", text, out, 3600))

@@ -13,7 +13,7 @@ import pytest
 
 from tests.asking import ask, ask_status
 from tests.journals import lines_with, read_lines
-from tests.system.conftest import SHORT_RECIPE, require_aravis
+from tests.system.conftest import SHORT_RECIPE
 from tests.system.resume_process import Daemon
 from tests.system.test_run import at_step, fault
 from thermostand.experiments.steps import Capture
@@ -34,11 +34,6 @@ from thermostand.stand.simulator import ControlSocket
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")
 ITEMS_PER_LIFE = 400  # about a set-point's worth: with fewer the night would hardly get on
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 async def end_laboratory(order: Order) -> None:
@@ -110,7 +105,7 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
     assert described == {p.step_id: p.step.frames for p in plan if isinstance(p.step, Capture)}
     found = verify(directory, lambda done, text: None)
     assert found.is_sound, found.findings
-    with pytest.raises(SessionError, match="its run is complete; there is nothing to resume"):
+    with pytest.raises(SessionError, match="is complete"):
         interruption(directory)
     return session
 
@@ -168,7 +163,7 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
         assert (await asyncio.to_thread(ask, directory, "pause"))["reasons"] == ["operator"]
         status = await asyncio.to_thread(ask_status, directory)
         assert (status.state, status.reasons, status.recipe, status.frames_lost) == ("held", ("operator",), "short", 0)
-        with pytest.raises(SessionError, match="a daemon is running this session already"):
+        with pytest.raises(SessionError, match="is running this session"):
             interruption(directory)
         assert (await asyncio.to_thread(ask, directory, "continue"))["reasons"] == []
         await asyncio.to_thread(ask, directory, "stop")
@@ -176,7 +171,7 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
     def start(work: Callable[[], Coroutine[None, None, None]]) -> Callable[[Hub], None]:
         return at_step("soak", lambda: tasks.append(asyncio.create_task(work())))
 
-    with pytest.raises(Interrupted, match="stopped by the operator; the stand is safe"):
+    with pytest.raises(Interrupted, match="stopped by the operator"):
         await run_virtual(ordered, out, None, start(pause_and_stop))
     (directory,) = out.iterdir()
     kinds = [event.kind for event in Session.open(directory).events()]
@@ -203,16 +198,16 @@ def test_a_session_whose_files_or_journal_are_not_its_own_is_not_resumed(tmp_pat
     journal = directory / JOURNAL_NAME
     begun = read_lines(journal.read_bytes())[0][0]
     journal.write_bytes(lines_with([replace(begun, texts={**begun.texts, "recipe.yaml": "0"})]))
-    with pytest.raises(SessionError, match="the attached files are not those its run began with"):
+    with pytest.raises(SessionError, match="attached files"):
         interruption(directory)
     journal.write_bytes(lines_with([replace(begun, plan="0")]))
-    with pytest.raises(SessionError, match="this version of thermostand makes another plan of its recipe"):
+    with pytest.raises(SessionError, match="makes another plan"):
         interruption(directory)
     journal.write_bytes(b"")
-    with pytest.raises(SessionError, match="its run had not begun when it was killed; begin a new run"):
+    with pytest.raises(SessionError, match="had not begun"):
         interruption(directory)
     journal.unlink()
-    with pytest.raises(SessionError, match="has no journal of a run"):
+    with pytest.raises(SessionError, match="no journal"):
         interruption(directory)
     asyncio.run(end_laboratory(ordered))
 

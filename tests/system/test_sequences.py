@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.conftest import WHOLE_SENSOR
 from thermostand.compensation.observations import observe
 from thermostand.experiments.steps import Role
 from thermostand.foundation.items import Event, StepMark, StepState
@@ -41,12 +41,7 @@ experiments:
 HOME_CHECKS = 4 + 6  # both axes: twice in the calibration, three times in the validation
 
 
-@pytest.fixture
-def _aravis(compiled_fit: None) -> None:
-    require_aravis()
-
-
-@pytest.mark.usefixtures("_aravis")
+@pytest.mark.usefixtures("compiled_fit")
 async def test_the_sequences_run_over_the_wire_and_leave_what_the_paper_needs(
     tmp_path: Path, order: Callable[..., Order]
 ):

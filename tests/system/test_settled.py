@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.journals import read_lines
-from tests.system.conftest import WHOLE_SENSOR, require_aravis
+from tests.system.conftest import WHOLE_SENSOR
 from thermostand.compensation.observations import Observations, observe
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
@@ -34,12 +34,7 @@ NEVER = RECIPE.replace("drift_px_per_min: 0.004", "drift_px_per_min: 0.0001").re
 NEVER = NEVER.replace("dwell_s: 3600", "dwell_s: 900")
 
 
-@pytest.fixture
-def _aravis() -> None:
-    require_aravis()
-
-
-pytestmark = pytest.mark.usefixtures("_aravis", "compiled_fit")
+pytestmark = pytest.mark.usefixtures("compiled_fit")
 
 
 async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: Path, order: Callable[..., Order]):

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.system.conftest import require_aravis
 from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import rms_px
@@ -32,7 +31,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
-pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
+pytestmark = pytest.mark.nightly
 
 CYCLE = "[31, 34, 38, 45, 48, 52, 48, 45, 38, 34, 31, 24, 20, 17, 10, 17, 20, 24]"
 UNSEEN = "[27, 41, 50, 36, 22, 12]"
@@ -61,11 +60,6 @@ LEAST_SAVED = {"settled": 0.25, "hurried": 0.38}
 PAPER_MOST_WORSE = {"settled": 1.25, "hurried": 1.5}
 # The thermal form does. Measured: 1.4 and 4.5, 2.1 and 4.1, 2.8 and 6.2.
 THERMAL_MOST_WORSE_MPX = {"settled": 1.5, "hurried": 3.5}
-
-
-@pytest.fixture
-def _aravis() -> None:
-    require_aravis()
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 import yaml
 
 from tests import forked
@@ -24,12 +23,8 @@ RECIPE = (
 STAND = [sys.executable, "-m", "thermostand.stand.cli"]
 
 
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
-
-
 def begun(tmp_path: Path, name: str, *arguments: str) -> subprocess.Popen[str]:
+    require_aravis()
     command = [*STAND, *arguments, "--virtual-time", "--out", str(tmp_path / name)]
     return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

@@ -71,7 +71,7 @@ async def test_a_frozen_disk_costs_counted_frames_and_neither_telemetry_nor_time
 
     assert np.median(late_s) < 0.05  # a busy machine; what waits for the disk is late by 1 s in the median
     assert max(late_s) < 1.0
-    assert any("the disk did not take them in time" in text for text in reported_meanwhile)
+    assert any("did not take them" in text for text in reported_meanwhile)
     published = (50 + FROZEN_TICKS + 50) // 5
     assert saved_meanwhile.frames == 10
     assert saved.frames + saved.frames_lost == published

@@ -71,7 +71,7 @@ async def test_a_lost_acknowledgement_does_not_spoil_homing(bench: Bench, letter
 async def test_a_zero_that_never_comes_through_is_a_fault(bench: Bench) -> None:
     await bench.axis.open()
     bench.tap.ignored = {"zero"}
-    with pytest.raises(DeviceFault, match=r"could not be set to zero, it is -100\.00"):
+    with pytest.raises(DeviceFault, match=r"it is -100\.00"):
         await bench.axis.home()
 
 
@@ -135,7 +135,7 @@ async def test_speeds_in_thousandths_are_read_as_such_and_a_move_has_the_time_it
         await axis.read()
     bench.plug(bench.tap)
     *_, homed = await axis.read()
-    assert homed.reason == "speed 100 steps/s, not 1000 steps/s as in its profile"
+    assert "speed 100 steps/s, not 1000" in homed.reason
     await axis.move_to(6.0)  # takes longer than at 1000 steps/s
     assert (await bench.position()).value == pytest.approx(6.0)
 

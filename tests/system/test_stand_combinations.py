@@ -243,7 +243,7 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
             with pytest.raises(ConfigError, match=sentence):
                 check_plan(recipe(does).plan(), config)
     if data["cameras"] and config.relays is None:
-        with pytest.raises(ConfigError, match="no relay switches the cameras"):
+        with pytest.raises(ConfigError, match="no relay switches"):
             check_plan(recipe([{"power_camera": False}]).plan(), config)
     said = [f"no {each.what}" for each in absences(config)]
     expected = [absent for choice in combination for absent in choice.absent]
@@ -339,12 +339,10 @@ async def test_each_combination_is_reported(combination: Combination, tmp_path: 
 def test_one_thermometer_alone_has_to_be_accepted_by_name_and_is_not_controlled_by():
     data = copy.deepcopy(SIMULATED)
     thermometers("air")(data)
-    with pytest.raises(
-        ConfigError, match=r"witnesses: 0 is outside the safe range \(at least 1\): no thermometer would"
-    ):
+    with pytest.raises(ConfigError, match="witnesses: 0 is outside"):
         configured(data)
     one_thermometer(data)
     configured(data)
     software(data)
-    with pytest.raises(ConfigError, match="regulator controls by the air's thermometer, and no other would show"):
+    with pytest.raises(ConfigError, match="no other would show"):
         configured(data)

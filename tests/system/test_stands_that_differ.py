@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.system.conftest import require_aravis
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.recording.reading.session import Session
@@ -27,11 +26,6 @@ FRAMES = """  - open_flap
   - capture: {frames: 2, interval_s: 10, exposure_s: 0.1, role: reference, chamber_degC: 27}
   - close_flap
 """
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 def bare(data: dict[str, Any]) -> None:
@@ -82,7 +76,7 @@ async def test_a_window_a_camera_and_no_cold_is_a_stand(tmp_path: Path, build: C
     assert reported == ["flap", "stages", "compressor", "thermometer in the laboratory"]
     assert max(session.readings("regulator.pv")[1]) > 26
     assert not [channel for channel in session.channels() if channel.startswith("flap.")]
-    with pytest.raises(ConfigError, match="this stand has no axis 'linear', only none"):
+    with pytest.raises(ConfigError, match="no axis 'linear', only none"):
         check_plan(Recipe.model_validate(yaml.safe_load(RECIPE + "  - move_to: {linear: 3}\n")).plan(), ordered.config)
 
 
@@ -101,7 +95,7 @@ async def test_sixteen_thermometers_other_stages_and_instruments_are_one(tmp_pat
 
 def test_what_a_stand_lacks_is_said_before_it_runs(build: Callable[..., Order]):
     assert absences(build(lambda data: None, RECIPE).config) == ()
-    with pytest.raises(ConfigError, match="needs a camera, and this stand has none"):
+    with pytest.raises(ConfigError, match="needs a camera"):
         check_plan(
             Recipe.model_validate(yaml.safe_load(RECIPE + FRAMES)).plan(),
             build(lambda data: data.pop("cameras") and None, RECIPE).config,

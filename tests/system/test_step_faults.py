@@ -10,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.asking import ask
-from tests.system.conftest import require_aravis
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
 from thermostand.foundation.exit_codes import FAILED, NOT_CLEARED
 from thermostand.foundation.hub import Hub
@@ -45,11 +44,6 @@ steps:
   - close_flap
   - stop_chamber
 """
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 @dataclass

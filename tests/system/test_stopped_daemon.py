@@ -8,11 +8,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 import yaml
 
 from tests import forked
-from tests.system.conftest import FAST, require_aravis
+from tests.system.conftest import FAST
 from tests.system.gateway import gateway
 from tests.system.test_unrecorded_heat import SOAK, heater_is, plant
 from thermostand.recording.reading.session import Session
@@ -22,11 +21,6 @@ LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other thin
 STOPPED_S = 1.5  # 6 periods of the guard, and less than the camera waits for its client
 RELAYS, THERMOMETERS = 2, 3  # units
 HEATER_FOR_A_TIME = bytes([RELAYS, 5, 0x02, 0x00])  # unit, function, address
-
-
-@pytest.fixture(autouse=True)
-def _aravis() -> None:
-    require_aravis()
 
 
 async def until(condition: Callable[[], bool]) -> None:

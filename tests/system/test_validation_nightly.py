@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.system.conftest import require_aravis
 from thermostand.compensation import cli
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
-pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures("_aravis")]
+pytestmark = pytest.mark.nightly
 
 CYCLE = """
 name: cycle
@@ -61,11 +60,6 @@ experiments:
 FRAMES = {"frame_encoding": "roi", "whole_every_s": 36000.0}
 LEAST_BEFORE_um = (10.0, 30.0, 30.0)
 GOAL_um = (3.0, 3.0, 10.0)
-
-
-@pytest.fixture
-def _aravis() -> None:
-    require_aravis()
 
 
 def compensate(*arguments: str | Path) -> str:
