@@ -84,7 +84,7 @@ def recipe(*entries: object) -> Recipe:
 def test_a_recipe_names_it_and_its_values_are_checked():
     (_, planned) = recipe({"start_chamber": 24.0}, {"lamp_on": 40.0}).plan()
     assert (planned.step.kind, planned.step.parameters) == ("lamp_on", {"percent": 40.0})
-    with pytest.raises(ConfigError, match=r"own.yaml: steps.1.lamp_on: must be .* 100$"):
+    with pytest.raises(ConfigError, match=r"own.yaml: steps.1.lamp_on: must be .* 100 "):
         recipe({"lamp_on": 140.0})
     with pytest.raises(ConfigError, match=r"own.yaml: steps.1: lamp_on needs"):
         recipe("lamp_on")
