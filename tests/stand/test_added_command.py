@@ -38,18 +38,18 @@ class Flushing(SecopDesk):
 
     @command("/run/flush")
     async def flush(self, who: Who, given: FlushRequest) -> str:
-        """Blow dry air through the chamber.
+        """Blow dry air.
 
         Example: stand flush 5
         """
         if given.for_s > 30:
-            raise Conflict("there is air for 30 s")
+            raise Conflict("air for 30 s")
         return f"flushed for {given.for_s:g} s" + (", gently" if given.gently else "")
 
 
 def test_it_is_in_the_table_with_its_words():
     found = commands_of(Flushing)["flush"]
-    assert (found.title, found.summary) == ("Flush", "Blow dry air through the chamber.")
+    assert (found.title, found.summary) == ("Flush", "Blow dry air.")
     assert "flush" not in commands_of(SecopDesk)
 
 
@@ -75,7 +75,7 @@ async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp
         assert row == {
             "name": "flush",
             "title": "Flush",
-            "text": "Blow dry air through the chamber.",
+            "text": "Blow dry air.",
             "method": "POST",
             "path": "/api/v1/run/flush",
             "argument": FlushRequest.model_json_schema(),
@@ -105,14 +105,14 @@ async def test_secop_has_it_and_each_order_is_recorded_with_what_came_of_it(tmp_
         assert described["datainfo"]["argument"]["type"] == "double"
         assert (await talk.asked("do run:_flush 5"))[0] == "done"
         assert (await talk.asked("do run:_flush 61"))[2][0] == "RangeError"
-        assert (await talk.asked("do run:_flush 40"))[2][:2] == ["Impossible", "there is air for 30 s"]
+        assert (await talk.asked("do run:_flush 40"))[2][:2] == ["Impossible", "air for 30 s"]
     assert [each.text.partition(": ")[2] for each in told] == [
         "flush for_s=5.0",
-        "flush for_s=40.0: refused: there is air for 30 s",
+        "flush for_s=40.0: refused: air for 30 s",
     ]
     assert [(each.data["verb"], each.data["arguments"], each.data["result"]) for each in told] == [
         ("flush", {"for_s": 5.0}, "done"),
-        ("flush", {"for_s": 40.0}, "refused: there is air for 30 s"),
+        ("flush", {"for_s": 40.0}, "refused: air for 30 s"),
     ]
 
 

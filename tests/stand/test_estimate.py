@@ -150,7 +150,7 @@ def test_how_warm_the_run_finds_the_camera_nobody_knows_before_a_run_has_shown_i
     plan = planned(CoolDown(1.0, 1480.0, 7200.0), before, CoolDown(1.0, 1480.0, 7200.0))
     first, _, second = price(plan, config)
     assert first.duration_s == second.duration_s == pytest.approx(1480.0 * math.log(20.0))
-    assert "a camera that was on" in first.warning
+    assert "camera that was on" in first.warning
     assert second.warning == ""
     learned = Learned(overheads_s={first.work: -4423.6}, nights=("last",))
     cold, _, warm = price(plan, config, learned)

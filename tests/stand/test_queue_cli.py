@@ -62,7 +62,7 @@ async def test_what_has_ended_and_why_nothing_is_begun_are_listed(tmp_path: Path
         result = await invoke(tmp_path, "list")
     assert "2:05:00" in result.stdout
     assert result.stdout.rstrip().endswith("too\\nwarm")
-    assert result.stderr == "halted by run 1: too\\nwarm; remove the cause, then `stand clear`\n"
+    assert result.stderr.startswith("halted by run 1: too\\nwarm; ")
 
 
 @pytest.mark.parametrize("arguments", [("move", "one", 1), ("move", 1), ("add",)])

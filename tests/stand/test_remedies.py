@@ -72,14 +72,14 @@ def vars_of(seen: Event) -> dict[str, object]:
 
 
 def test_a_rule_of_the_guard_that_is_added_has_its_row():
-    name = guard_rule("too_loud", "the fan is too loud", "oil it")
+    name = guard_rule("too_loud", "the fan", "oil it")
     try:
         kind = KINDS[GUARD + name]
         trip, warning = (kind.at(0, "85 dB", rule=name, action=action) for action in ("abort", "warn"))
         assert (trip.level, warning.level, trip.text) == ("error", "warning", "85 dB")
         assert (alert_of(trip), alert_of(warning)) == (Alert("trip", "guard"), None)
         assert next_command(warning.kind, warning.data) == "oil it"
-        assert "| `guard.too_loud` that only warns | warning | the fan is too loud | oil it |" in troubleshooting()
+        assert "| `guard.too_loud` that only warns | warning | the fan | oil it |" in troubleshooting()
     finally:
         del KINDS[GUARD + name]
 

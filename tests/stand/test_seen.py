@@ -27,14 +27,13 @@ async def test_after_a_stop_while_a_wire_is_gone_it_is_told_what_is_not_confirme
         here.stand.safety.demand()
         first = [NotConfirmed(name=name, since_ns=0) for name in ("relays", "regulator", "flap")]
         assert seen(here).not_confirmed == (first[0].model_copy(update={"timer_s": 15.0}), *first[1:])
-        assert f"{BEGIN}: flap is being made safe" in not_yet_safe(seen(here))
+        assert any(line.startswith(f"{BEGIN}: flap ") for line in not_yet_safe(seen(here)))
         await here.passes(2.5)
         failure = "relays did not confirm its safe state: relays: no answer"
         assert seen(here).not_confirmed == (NotConfirmed(name="relays", since_ns=0, reason=failure, timer_s=15.0),)
-        assert list(not_yet_safe(seen(here))) == [
-            f"{BEGIN}: {failure}; it is tried again until it confirms",
-            "heat and cold: the relay board's own timer ends them, at the latest 15 s after that time",
-        ]
+        first_line, timer_line = not_yet_safe(seen(here))
+        assert first_line.startswith(f"{BEGIN}: {failure}; ")
+        assert "15 s" in timer_line
         await here.passes(6.0)
         assert seen(here).not_confirmed == ()
         assert list(not_yet_safe(seen(here))) == []

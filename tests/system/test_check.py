@@ -90,7 +90,7 @@ def test_without_moves_each_device_tells_what_it_is_and_the_record_goes_with_ses
     texts = {"config.yaml": read_document(config), **register_texts(load_config(config))}
     assert doubt(config, record, texts, is_simulated=False) == ""
     changed = doubt(config, record, {**texts, "config.yaml": "another"}, is_simulated=True)
-    assert changed.startswith(f"{config} has changed since the check of ")
+    assert changed.startswith(f"{config} has changed since ")
     assert "registers-relays.yaml has changed" in doubt(
         config, record, {**texts, "registers-relays.yaml": ""}, is_simulated=True
     )

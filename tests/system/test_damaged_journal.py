@@ -56,7 +56,7 @@ async def test_a_stopped_run_goes_on_without_the_first_line_of_its_journal_and_o
     done = Counter(mark.step_id for mark in session.steps() if mark.state is StepState.DONE)
     assert done == Counter(planned.step_id for planned in plan)
     (damage,) = [event for event in session.events() if event.kind == "journal_damaged"]
-    assert damage.text.startswith(f"journal.jsonl: line 1 and 2 more of {count} are damaged; the lines after it count")
+    assert damage.text.startswith(f"journal.jsonl: line 1 and 2 more of {count} are damaged")
     assert len((directory / "journal.jsonl.damaged").read_bytes().splitlines()) == count
     assert (verify(directory).run, verify(directory).files) == (RunOutcome.COMPLETE, Files.DAMAGED)
 

@@ -30,7 +30,7 @@ def broken(folder: Path, *changes: str) -> bool:
     subprocess.run(["spin", *times, *changes, "-a", MODEL], cwd=folder, check=True)
     subprocess.run(["gcc", "-O2", "-DSAFETY", "-o", "pan", "pan.c"], cwd=folder, check=True)
     done = subprocess.run(["./pan", "-m2000000", "-w24"], cwd=folder, capture_output=True, text=True, check=True)
-    assert "max search depth too small" not in done.stdout
+    assert "max search depth" not in done.stdout
     return (folder / f"{MODEL.name}.trail").exists()
 
 

@@ -123,7 +123,7 @@ async def test_the_guard_looks_on_and_a_stop_leaves_while_everything_hangs(
     assert status == 130, said
     assert "stopped by the operator" in said
     assert "limit 60 s" in said
-    assert "the guard has not looked for" not in said  # what is reported when two looks are more than two periods apart
+    assert "guard has not looked" not in said  # what is reported when two looks are more than two periods apart
     assert sum(answers) > CLIENTS
     assert (safe_ns - begun_ns) / NS_PER_S < 15.0
     assert (left_ns - safe_ns) / NS_PER_S < 15.0  # 5 s where nothing else keeps the machine busy

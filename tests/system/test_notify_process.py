@@ -86,7 +86,7 @@ def test_a_process_that_was_killed_is_replaced_when_something_is_to_be_reported(
 
 def test_a_process_that_cannot_be_replaced_is_a_sentence_and_tried_again_the_next_time(daemon, tmp_path):
     os.kill(daemon.pid, signal.SIGKILL)
-    assert "/bin/sh could not be started ([Errno 24]" in daemon.tell("too warm!")
+    assert "/bin/sh could not" in daemon.tell("too warm!")
     assert daemon.tell("too cold") == ""
     assert (tmp_path / "reported").read_text() == "too cold\n"
 

@@ -110,9 +110,9 @@ async def test_stop_pressed_twice_in_any_phase_leaves_the_stand_safe(
     (directory,) = out.iterdir()
     session = Session.open(directory)
     check_safe(session)
-    (end,) = [event.text for event in session.events() if event.kind == "run.end"]
+    (end,) = [event.data["status"] for event in session.events() if event.kind == "run.end"]
     stopped = phase not in ("opening", "run.end")
-    assert end == ("aborted: stopped by the operator" if stopped else "complete")
+    assert end == ("aborted" if stopped else "complete")
     kinds = [event.kind for event in session.events()]
     assert "held" not in kinds[kinds.index("run.end") :]  # a run that has ended cannot be held
     assert answers

