@@ -14,7 +14,7 @@ import pytest
 
 from tests.addresses import camera_address, free_port
 from tests.stand.secop_talk import talking
-from tests.system.conftest import CORNER, FAST, require_aravis
+from tests.system.conftest import CORNER, FAST
 from thermostand.foundation.errors import SessionError, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark
