@@ -110,7 +110,7 @@ async def test_stop_pressed_twice_in_any_phase_leaves_the_stand_safe(
     (directory,) = out.iterdir()
     session = Session.open(directory)
     check_safe(session)
-    (end,) = [event.data["status"] for event in session.events() if event.kind == "run.end"]
+    (end,) = [event.text.partition(":")[0] for event in session.events() if event.kind == "run.end"]
     stopped = phase not in ("opening", "run.end")
     assert end == ("aborted" if stopped else "complete")
     kinds = [event.kind for event in session.events()]

@@ -210,7 +210,7 @@ async def test_an_interrupt_in_any_step_leaves_the_stand_safe(tmp_path: Path, or
     for channel in ("regulator.running", "relays.heater_enable", "relays.compressor", "linear.moving"):
         assert session.readings(channel)[1][-1] == 0, channel
     assert session.readings("flap.position")[1][-1] == pytest.approx(0, abs=0.02)
-    assert [event.data["status"] for event in session.events() if event.kind == "run.end"] == ["aborted"]
+    assert [event.text[:7] for event in session.events() if event.kind == "run.end"] == ["aborted"]
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.2, 0.6, 1.0])
