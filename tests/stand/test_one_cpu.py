@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from thermostand.stand.service import run
 from thermostand.stand.service.run import one_cpu
 
 CPUS = "import os; print(sorted(os.sched_getaffinity(0)))"
@@ -48,15 +49,11 @@ def test_the_cpus_are_given_back_also_after_an_error():
     assert os.sched_getaffinity(0) == usable
 
 
-HOLD = """
-import os, sys
-import thermostand.stand.service.run as one_cpu
-
-one_cpu._CPU_FOLDER = sys.argv[1]  # those of the machine may be taken by others just now
-with one_cpu.one_cpu():
-    print(sorted(os.sched_getaffinity(0)), flush=True)
-    input()
-"""
+def hold(folder: Path, told: Connection) -> None:
+    run._CPU_FOLDER = str(folder / "cpu{}")  # type: ignore[reportPrivateUsage]  # others may take the machine's now
+    with one_cpu():
+        told.send(os.sched_getaffinity(0))
+        threading.Event().wait()
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="there is one CPU only")
