@@ -1,0 +1,213 @@
+"""A channel that another package's device declares is found everywhere by its own name and unit."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.recording.test_export import csv_rows
+from thermostand.foundation.documents import parse_document
+from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.readings import Channel
+from thermostand.recording.exporting.export import export
+from thermostand.recording.exporting.topics import recorded_devices
+from thermostand.recording.reading.session import Session
+from thermostand.stand import simulator
+from thermostand.stand.assembly import recorded_devices as declared_devices
+from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.running.order import Order
+from thermostand.stand.service.run import run_virtual
+from thermostand.stand.serving.recorded_history import session_columns
+
+MODULE = '''
+"""A weather station that answers a line: `?` -> `1013.2 11.5 0.25 3.4`; a value that it has not is `-`."""
+
+import math
+from typing import Literal
+
+from thermostand.drivers.devices.kinds import DeviceKind
+from thermostand.drivers.settings import Identity, Polled
+from thermostand.drivers.wires.line_client import LineClient
+from thermostand.drivers.wires.link import SerialSettings
+from thermostand.foundation.addresses import ByteAddress
+from thermostand.foundation.calls import Lane
+from thermostand.foundation.readings import Channel, Reading, bad_reading
+
+CHANNELS = (
+    Channel("pressure", "hPa", "pressure"),
+    Channel("dew", "degC", "temperature"),
+    Channel("ratio", ""),
+    Channel("flow", "l/min", "flow"),
+)
+
+
+class Settings(Polled):
+    kind: Literal["station"]
+    address: ByteAddress
+
+
+class Station:
+    def __init__(self, name, settings, clock):
+        self.name, self.identity, self._clock, self._lane = name, None, clock, None
+        self._client = LineClient.at(name, settings.address, SerialSettings(9600, 1), (1.0, 0.0))
+
+    async def _ask(self):
+        def whole(data):
+            return data.decode() if data.endswith(b"\\n") else None
+
+        return (await self._lane.call(self._client.query, b"?\\n", whole)).split()
+
+    async def open(self):
+        self._lane = self._lane or Lane(self.name, self._clock)
+        await self._ask()
+        self.identity = Identity("Acme", "W1", "7", "")
+
+    async def close(self):
+        lane, self._lane = self._lane, None
+        if lane is not None:
+            await lane.call(self._client.close)
+            lane.close()
+
+    async def read(self):
+        now_ns = self._clock.now_ns()
+        return tuple(
+            bad_reading(f"{self.name}.{each.name}", each.unit, now_ns, "no sensor")
+            if text == "-"
+            else Reading(f"{self.name}.{each.name}", float(text), each.unit, now_ns)
+            for each, text in zip(CHANNELS, await self._ask(), strict=True)
+        )
+
+
+KIND = DeviceKind(
+    name="station",
+    settings=Settings,
+    make=lambda name, settings, around: Station(name, settings, around.clock),
+    channels=CHANNELS,
+)
+'''
+FAKE = """
+from thermostand.drivers.sim.wire import LineEngine
+
+
+class FakeStation:
+    def __init__(self, bench, name, settings):
+        self.asked = 0
+        bench.listen(name, settings["address"], lambda: LineEngine(self.answer))
+
+    def answer(self, line):
+        self.asked += 1
+        return b"1013.2 11.5 0.25 " + (b"-" if self.asked % 5 == 0 else b"3.4")
+"""
+RECIPE = """
+name: short
+experiments:
+  - steps: [{start_chamber: 24}, {soak: 120}]
+"""
+LAB = {"kind": "station", "address": "tcp:127.0.0.1:15098"}
+VALUES = {"pressure": 1013.2, "dew": 11.5, "ratio": 0.25, "flow": 3.4}
+UNITS = {"lab.pressure": "hPa", "lab.dew": "degC", "lab.ratio": "", "lab.flow": "l/min"}
+
+
+@pytest.fixture
+def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
+    """The package, installed, for this process and those that it starts. Called, it changes the package's text."""
+    folder = tmp_path / "site"
+    info = folder / "acme_station-1.0.dist-info"
+    info.mkdir(parents=True)
+    (folder / "acme_station.py").write_text(MODULE)
+    (folder / "acme_station_fake.py").write_text(FAKE)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-station\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[thermostand.devices]\nstation = acme_station:KIND\n"
+        "[thermostand.fakes]\nstation = acme_station_fake:FakeStation\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.setattr(simulator, "subprocess", subprocess)  # a program of its own, which sees what is installed
+
+    def changed(was: str, now: str) -> None:
+        (folder / "acme_station.py").write_text(MODULE.replace(was, now))
+        sys.modules.pop("acme_station", None)
+
+    yield changed
+    sys.modules.pop("acme_station", None)
+
+
+def stand_with(**changes: Any) -> StandConfig:
+    data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
+    data["devices"] = {"lab": LAB}
+    data["guard"] = {**data.get("guard", {}), **changes}
+    return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
+
+
+@pytest.mark.usefixtures("station")
+async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_path: Path, order: Callable[..., Order]):
+    session = Session.open(
+        await run_virtual(order(RECIPE, devices={"lab": LAB}), tmp_path / "out", None, lambda _: None)
+    )
+    declared = recorded_devices(session)["lab"]
+    assert (declared.kind, declared.channels) == (
+        "station",
+        (
+            Channel("pressure", "hPa", "pressure"),
+            Channel("dew", "degC", "temperature"),
+            Channel("ratio", ""),
+            Channel("flow", "l/min", "flow"),
+        ),
+    )
+    assert {channel: unit for channel, unit in session.units().items() if channel.startswith("lab.")} == UNITS
+    for name, value in VALUES.items():
+        times_ns, values = session.readings(f"lab.{name}")
+        assert len(times_ns) > 10
+        assert set(values[~np.isnan(values)]) == {value}
+    flow = session.readings("lab.flow")[1]
+    assert 0 < np.isnan(flow).sum() < len(flow), "each fifth is BAD, and NaN exactly there"
+    export(session, tmp_path / "exported", report=lambda done, text: None)
+    rows = csv_rows(tmp_path / "exported/telemetry/lab.csv")
+    assert [name for name in rows[0] if "quality" not in name][2:] == [
+        "pressure_hPa",
+        "dew_degC",
+        "ratio",
+        "flow_l_per_min",
+        "remarks",
+    ]
+    assert {(row["pressure_hPa"], row["ratio"], row["flow_l_per_min_quality"]) for row in rows} == {
+        ("1013.2", "0.25", "good"),
+        ("1013.2", "0.25", "bad"),
+    }
+    history = session_columns(session.path, 200)
+    assert {channel: history.units[channel] for channel in UNITS} == UNITS
+    assert {round(value, 1) for value in history.low["lab.pressure"].tolist() if value == value} == {1013.2}
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        (
+            "air pressure",
+            "lab: its kind station declares the channel 'air pressure', and a channel's name",
+        ),
+        ("a.b", "'a.b', and a channel's name is of letters"),
+        ("", "'', and a channel's name is of letters"),
+        ("dew", "declares the channel 'dew', twice; a channel has one name and one unit: correct the package"),
+    ],
+)
+def test_names_that_cannot_be_found_again_are_refused(station: Callable[[str, str], None], name: str, sentence: str):
+    station('Channel("pressure"', f'Channel("{name}"')
+    with pytest.raises(ConfigError, match=sentence):
+        declared_devices(stand_with())
+
+
+@pytest.mark.usefixtures("station")
+def test_two_devices_of_one_name_are_refused():
+    data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
+    data["devices"] = {"camera": LAB}
+    with pytest.raises(ConfigError, match="the name camera is that of two devices"):
+        parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
