@@ -166,7 +166,7 @@ def _constants(model: Mapping[str, Any]) -> Iterator[str]:
 
 def _functions(model: Mapping[str, Any]) -> Iterator[str]:
     """How the state's values go on, and the terms of them."""
-    at = drift_runtime.Drift(model).state.memory.at
+    at: dict[Any, int] = drift_runtime.Drift(model).state.memory.at
     values, means = ({part: f"{name}[{place}]" for part, place in at.items()} for name in ("now", "mean"))
     remembered = list(at)[len(drift_runtime.INPUTS) :]
     yield "static inline void drift_rest(double now[DRIFT_VALUES]) {"
@@ -187,7 +187,7 @@ def _functions(model: Mapping[str, Any]) -> Iterator[str]:
 def _terms(model: Mapping[str, Any]) -> list[tuple[Feature, float]]:
     """Each term, and what it is at the reference."""
     if model["form"] == "thermal":
-        terms = map(drift_runtime.expression_of, model["terms"])
+        terms: Iterable[Any] = map(drift_runtime.expression_of, model["terms"])
         return list(zip(terms, model["reference_features"], strict=True))
     low, high = model["camera_range_degC"]
     scaled = (CAMERA - (low + high) / 2) / ((high - low) / 2)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -332,7 +333,7 @@ def _guessed(model: ThermalModel, wrong_K: Float) -> tuple[Float, Float]:
     with the camera and the air wrong by so much; and how slowly each lag forgets it (L,)."""
     follower = Follower(model.memory.parts)
     inputs = np.array([model.origin.camera_degC, model.origin.ambient_degC]) + 1j * _TINY * wrong_K
-    rest = np.array(follower.rest([*inputs, 1.0]))  # a derivative is the imaginary part by a tiny imaginary step
+    rest: Any = np.array(follower.rest([*inputs, 1.0]))  # a derivative is the imaginary part by a tiny imaginary step
     lags = [place for place, _, is_play, _ in follower.parts if not is_play]
     values = np.repeat(rest.real[:, None].astype(complex), len(lags), axis=1)
     values[lags, np.arange(len(lags))] += 1j * rest.imag[lags]

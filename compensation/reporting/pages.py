@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+# What a template gives to a filter has no type.
+# pyright: reportUnknownLambdaType=false
 import importlib
 import importlib.metadata
 import json
@@ -59,7 +61,8 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     made.filters.update(_FILTERS)
-    made.globals.update(paper=document, flagged=flagged, reasons=_reasons)  # pyright: ignore[reportCallIssue] - as it does
+    names: dict[str, Any] = {"paper": document, "flagged": flagged, "reasons": _reasons}
+    made.globals.update(names)
     return made
 
 
@@ -84,8 +87,8 @@ def _each(values: Iterable[float], spec: str, over: float = 1.0) -> list[str]:
     return [format(value / over, spec) if math.isfinite(value) else "-" for value in values]
 
 
-def _counts(found: Mapping[str, int], *written: str) -> str:
-    return ", ".join(f"{count} {name.replace(*written) if written else name}" for name, count in found.items())
+def _counts(found: Mapping[str, int], before: str = "", after: str = "") -> str:
+    return ", ".join(f"{count} {name.replace(before, after) if before else name}" for name, count in found.items())
 
 
 def _reasons(validation: SpatialValidation) -> list[str]:
