@@ -138,7 +138,7 @@ def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp
     said = [str(difference) for difference in differences]
     assert "bus.address is" in said[0]
     assert len(said) == len({difference.path for difference in differences}) == 13
-    assert 'not ["/bin/rm", "-r", "/"]' in said
+    assert any('not ["/bin/rm", "-r", "/"]' in line for line in said)
 
 
 def test_a_thermometer_that_was_renamed_is_reported_as_one_that_came_and_one_that_went(tmp_path: Path):
