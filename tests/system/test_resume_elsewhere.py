@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -17,15 +18,16 @@ from tests.system.test_real_time import BRIEF
 from tests.system.test_resume import findable
 from tests.system.test_run import at_step, fault
 from thermostand.drivers.wires.camera_settings import TemperatureFeature
-from thermostand.foundation.errors import ConfigError, StandTripped
+from thermostand.foundation.errors import ConfigError, SessionError, StandTripped
 from thermostand.foundation.sealed import seal
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
 from thermostand.stand.running.opening.own_stand import on_this_stand
-from thermostand.stand.running.order import Order
+from thermostand.stand.running.order import Order, load_order
 from thermostand.stand.running.resume import interruption
-from thermostand.stand.service.queue_file import QUEUE_NAME
+from thermostand.stand.service import queue
+from thermostand.stand.service.queue_file import QUEUE_NAME, worked_on
 from thermostand.stand.service.run import Interrupted, resume, run_real, run_virtual
 
 CAPTURES = """
@@ -174,19 +176,13 @@ def test_a_simulated_session_never_reaches_a_real_flap_or_file(tmp_path: Path):
     ["../elsewhere", "..", ".", "/etc", "a/b", "a\\b", "a\x1b[2J", "a\nb", "a\0b", "x" * 256, 7, None, ["a"]],
 )
 def test_a_queue_that_names_another_folder_is_refused_and_nothing_is_run(tmp_path: Path, session: object):
-    out, recipe = tmp_path / "sessions", tmp_path / "recipe.yaml"
-    recipe.write_text(CAPTURES)
-    added = CliRunner().invoke(app, ["queue", "add", str(recipe), "--out", str(out)])
-    assert added.exit_code == 0, added.output
-    file = out / QUEUE_NAME
-    queue = json.loads(file.read_text())
-    queue["entries"][0] |= {"session": session, "state": "interrupted"}
-    file.write_bytes(seal("queue", json.dumps(queue)))
+    queue.append(tmp_path, queue.entry_of(load_order("warm-up", "simulated"), "simulated", 1))
+    file = tmp_path / QUEUE_NAME
+    document = json.loads(file.read_text())
+    document["entries"][0] |= {"session": session, "state": "interrupted"}
+    file.write_bytes(seal("queue", json.dumps(document)))
     before = sorted(tmp_path.rglob("*"))
-    for command in (["start", "--virtual-time"], ["list"]):
-        refused = CliRunner().invoke(app, ["queue", *command, "--out", str(out)], catch_exceptions=False)
-        assert refused.exit_code == 1
-        (line,) = refused.stderr.splitlines()
-        assert f"{file}: is damaged (entries.1.session: " in line
-        assert refused.stdout == ""
+    for take in (queue.queued, worked_on):
+        with pytest.raises(SessionError, match=re.escape(f"{file}: is damaged (entries.1.session: ")):
+            take(tmp_path)
     assert {path for path in tmp_path.rglob("*") if not path.name.startswith(".")} <= set(before)
