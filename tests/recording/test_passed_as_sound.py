@@ -201,7 +201,7 @@ CASES = {
     ),
     "an empty segment behind the last": (empty_segment, Files.DAMAGED, "telemetry/0006.mcap", True),
     "the channel of a device taken out": (
-        lambda s: rewrite_without_topic(s, "/chamber/state"), Files.DAMAGED, "telemetry/0000.mcap", True
+        lambda s: rewrite_without_topic(s, "/readings/regulator"), Files.DAMAGED, "telemetry/0000.mcap", True
     ),
     "the journal's last lines cut off": (
         lambda s: rewrite_journal(s, journal_lines_of(s)[:-2]), Files.INCOMPLETE, JOURNAL_NAME, True
