@@ -68,7 +68,7 @@ def test_list_and_info_show_utc_and_durations_of_the_stands_clock(session: Path)
 def test_an_export_keeps_the_recorded_instant_and_the_utc_of_then(session: Path, tmp_path: Path):
     ask("export", session, "--out", tmp_path / "out")
     tables = [*(tmp_path / "out").glob("*.csv"), *(tmp_path / "out").glob("*/*.csv")]
-    assert len(tables) == 8  # steps, events, frames, their index, four topics of the telemetry
+    assert len(tables) == 9  # steps, events, frames, their index, five devices
     for path in tables:
         times = [(int(row["time_ns"]), row["time_utc"]) for row in table(path)]
         assert times

@@ -280,18 +280,16 @@ def counted(number, name, state):
 
 
 def queued(stand, names):
-    said = stand.program("queue", "list", "--out", stand.sessions, "--json")
-    yield from traceback_in(said)
     its = names & {"queue.json", "queue.json.last"}
-    if said.exit_code:
+    try:
+        runs = [(entry.id, entry.state.value) for entry in queue.queued(stand.sessions).entries]
+    except SessionError as error:
         if not its:
             yield "a sound queue is blamed"
-        elif not said.stderr.startswith("error: ") or "queue.json" not in said.stderr:
-            yield f"queue: {said.stderr}"
+        elif "queue.json" not in str(error):
+            yield f"queue: {error}"
         return
-    runs = [(run["id"], run["state"]) for run in json.loads(said.stdout)["runs"]]
-    true = [(1, "interrupted"), *((n, "waiting") for n in range(2, 6))]
-    if runs != true:
+    if runs != [(1, "interrupted"), *((n, "waiting") for n in range(2, 6))]:
         yield f"the queue is {runs} and nothing says so"
 
 
