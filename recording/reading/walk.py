@@ -334,7 +334,7 @@ class Blocks:
         self._count = 0
         self._end = 0  # of the last one
         self._largest_bytes = FIRST_BLOCK_BYTES
-        self._largest_index_bytes = _index_bytes(Counter((0,)))
+        self._largest_index_bytes = 0
 
     def note(self, begin: int, chunk_end: int, messages: Counter[int]) -> None:
         """The block of the sound chunk [begin, chunk_end), with so many messages of each channel."""
@@ -363,7 +363,8 @@ class Blocks:
 
     def _claimed_bytes(self, claim: Claim) -> int:
         """The size of the block that begins with that record."""
-        rest_bytes = self._largest_index_bytes if claim.opcode == Opcode.CHUNK else FIRST_BLOCK_BYTES
+        is_known = claim.opcode == Opcode.CHUNK and self._count > 0
+        rest_bytes = self._largest_index_bytes if is_known else FIRST_BLOCK_BYTES
         return RECORD.size + claim.length + rest_bytes
 
 

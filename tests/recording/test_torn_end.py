@@ -74,10 +74,11 @@ def test_the_first_block_may_be_torn_like_any_other(left):
     first = left.written.blocks[0]
     other = FRAMES if left.written.series == TELEMETRY else TELEMETRY
     write_segment(left.folder.parent / other, other, range(3), finish=True)
-    for begin in (0, 8, 100, first.begin, first.begin + 9, first.end - 5):
-        left.part.write_bytes(zeros_from(left.written.data[: first.end], begin))
-        (done,) = salvage_session(left.folder.parent)
-        assert (done.lost_bytes, done.kept) == (0, None), begin
+    for begin in (0, 8, 100, first.begin, first.begin + 9, first.begin + 60, first.end - 5):
+        for end in (first.end, left.written.blocks[1].begin):  # with the message indexes, whose size no other tells
+            left.part.write_bytes(zeros_from(left.written.data[:end], begin))
+            (done,) = salvage_session(left.folder.parent)
+            assert (done.lost_bytes, done.kept) == (0, None), (begin, end)
 
 
 @pytest.mark.parametrize("behind_head", [0, 200])
