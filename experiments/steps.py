@@ -38,6 +38,7 @@ from thermostand.experiments.parameters import (
 from thermostand.foundation.document_faults import path_text
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.plugins import load_point
 
 GROUP = "thermostand.steps"
 LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
@@ -914,11 +915,7 @@ def kind_of_step(kind: str) -> type[Step] | None:
     that adds it cannot be loaded."""
     if kind not in STEPS and kind.islower():  # what other versions called `Soak` is not looked for, mark by mark
         for point in entry_points(group=GROUP, name=kind):
-            try:
-                point.load()
-            except Exception as error:  # importing a stranger's module may raise anything
-                package = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
-                raise ConfigError(f"{kind}: {package} cannot be loaded ({error}); reinstall it") from error
+            load_point(point)
     return STEPS.get(kind)
 
 

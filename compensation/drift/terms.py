@@ -9,7 +9,7 @@ names.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from itertools import product
 from typing import Annotated, Any, ClassVar, cast
 
@@ -21,7 +21,7 @@ from thermostand.compensation.expression import AIR, CAMERA, Expression, Feature
 from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory
 from thermostand.foundation.document_faults import path_text
 from thermostand.foundation.documents import Document
-from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.plugins import load_point
 
 GROUP = "thermostand.drift_terms"
 MOTIONS = 8
@@ -207,16 +207,8 @@ class OfPartPlay(Term):
 def usual_terms() -> tuple[Term, ...]:
     """What a camera may be moved by: the terms of a fit. ConfigError where a package's cannot be loaded."""
     for point in entry_points(group=GROUP):
-        _load(point)
+        load_point(point)
     return tuple(term for kind in TERMS.values() for term in kind.usual())
-
-
-def _load(point: EntryPoint) -> None:
-    try:
-        point.load()
-    except Exception as error:  # importing a stranger's module may raise anything
-        package = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
-        raise ConfigError(f"{point.name}: {package} cannot be loaded ({error}); reinstall it") from error
 
 
 def term_of(value: object) -> Term:
@@ -229,7 +221,7 @@ def term_of(value: object) -> Term:
     kind = given.pop("kind", None)
     if kind not in TERMS:
         for point in entry_points(group=GROUP, name=str(kind)):
-            _load(point)
+            load_point(point)
     if kind not in TERMS:
         raise ValueError(f"no model has a {kind}; there are {', '.join(TERMS)}")
     try:

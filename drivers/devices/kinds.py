@@ -14,11 +14,7 @@ import re
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
 from typing import Any, Literal, NamedTuple, Protocol, cast
-
-from pydantic import ValidationError
-from pydantic_core import PydanticCustomError
 
 import thermostand.drivers.devices
 from thermostand.drivers.devices.checking import DeviceLook, check_answers
@@ -27,10 +23,10 @@ from thermostand.drivers.settings import OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.registers import RegisterMap
 from thermostand.foundation.clock import Clock
-from thermostand.foundation.document_faults import path_text, words
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
 from thermostand.foundation.items import Item
+from thermostand.foundation.plugins import check_settings, load_row
 from thermostand.foundation.readings import Channel, Reading
 
 _CHANNEL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
@@ -260,17 +256,12 @@ def added_kind(name: str) -> DeviceKind:
     it cannot be loaded."""
     if ours := next((kind for kind in built_in() if (kind.name, kind.section) == (name, ADDED)), None):
         return ours
-    for point in entry_points(group=GROUP, name=name):
-        package = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
-        try:
-            kind = point.load()
-        except Exception as error:  # importing a stranger's module may raise anything
-            raise ConfigError(f"{name}: {package} cannot be loaded ({error}); reinstall it") from error
-        if not isinstance(kind, DeviceKind) or (kind.name, kind.section) != (name, ADDED):
-            raise ConfigError(f"{name}: {package} has no DeviceKind of that name there; correct the package")
-        return kind
-    known = ", ".join(sorted({point.name for point in entry_points(group=GROUP)})) or "none installed"
-    raise ConfigError(f"no package adds a device of kind {name!r}; there are {known}")
+    kind = load_row(GROUP, name, DeviceKind, "a device of kind")
+    if kind.section != ADDED:
+        raise ConfigError(
+            f"{name}: its DeviceKind has the section {kind.section!r} of another kind; correct the package"
+        )
+    return kind
 
 
 def added_settings(data: object) -> object:
@@ -279,12 +270,10 @@ def added_settings(data: object) -> object:
         return data
     keys = cast("dict[str, object]", data)
     try:
-        return added_kind(str(keys.get("kind", ""))).settings.model_validate(keys)
+        kind = added_kind(str(keys.get("kind", "")))
     except ConfigError as error:
         raise ValueError(str(error)) from error
-    except ValidationError as error:
-        faults = (f"{path_text(each['loc'])}: {words(each)}" for each in error.errors())
-        raise PydanticCustomError("device", "{text}", {"text": "; ".join(faults)}) from error
+    return check_settings(kind.settings, keys)
 
 
 def equipment_of(config: object, added: Mapping[str, Any]) -> tuple[Equipment, ...]:

@@ -20,6 +20,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from thermostand.experiments.steps import Step
 from thermostand.experiments.written import MOST_STEPS
 from thermostand.foundation.document_faults import words
+from thermostand.foundation.plugins import describe, package_of
 
 GROUP = "thermostand.experiments"
 _AT_LEAST = {"frames": 1, "interval_s": 1e-6, "exposure_s": 1e-6}
@@ -30,9 +31,9 @@ def added_names() -> list[str]:
     return sorted({point.name for point in entry_points(group=GROUP)})
 
 
-def package_of(name: str) -> str:
+def adding_package(name: str) -> str:
     """The package that adds the experiment `name`, and its version, as in `acme-experiments 1.2`."""
-    return _package(_only(name))
+    return package_of(_only(name))
 
 
 def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
@@ -47,17 +48,17 @@ def added_steps(name: str, parameters: object) -> tuple[Step, ...]:
     try:
         steps = tuple(islice(cast("Iterable[object]", make(checked)), MOST_STEPS + 1))
     except Exception as error:  # another package's code may raise anything
-        raise ValueError(f"{name}: {_package(point)} makes no steps of these ({_described(error)})") from error
+        raise ValueError(f"{name}: {package_of(point)} makes no steps of these ({describe(error)})") from error
     faults = (f"step {number} {fault}" for number, step in enumerate(steps, 1) if (fault := _fault(step)))
     if fault := next(faults, ""):
-        raise ValueError(f"{name}: {_package(point)} makes a step that cannot be done: {fault}; correct the package")
+        raise ValueError(f"{name}: {package_of(point)} makes a step that cannot be done: {fault}; correct the package")
     return cast("tuple[Step, ...]", steps)
 
 
 def _only(name: str) -> EntryPoint:
     found = {point.value: point for point in entry_points(group=GROUP, name=name)}
     if len(found) != 1:
-        packages = " and ".join(sorted(_package(point) for point in found.values()))
+        packages = " and ".join(sorted(package_of(point) for point in found.values()))
         raise ValueError(f"{name}: {packages} have an experiment of that name; keep one of them installed")
     return next(iter(found.values()))
 
@@ -70,7 +71,7 @@ def _loaded(point: EntryPoint) -> tuple[Callable[[BaseModel], object], type[Base
         model = get_type_hints(make)[parameter]
     except Exception as error:  # importing a stranger's module may raise anything
         text = (
-            f"{point.name}: {_package(point)} cannot be loaded ({_described(error)}); reinstall it, or leave this out"
+            f"{point.name}: {package_of(point)} cannot be loaded ({describe(error)}); reinstall it, or leave this out"
         )
         raise ValueError(text) from error
     if not (inspect.isclass(model) and issubclass(model, BaseModel)):
@@ -112,11 +113,3 @@ def _within(name: str, error: ValidationError) -> ValidationError:
         for fault in error.errors()
     ]
     return ValidationError.from_exception_data(name, faults)
-
-
-def _package(point: EntryPoint) -> str:
-    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.value
-
-
-def _described(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:300]

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Any, cast
 
-from pydantic import ValidationError
-from pydantic_core import PydanticCustomError
-
-from thermostand.foundation.document_faults import path_text, words
 from thermostand.foundation.documents import Document
+from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.events import GUARD, KINDS, guard_rule
+from thermostand.foundation.plugins import check_settings, load_row
 from thermostand.stand.fault import Watch
 
 GROUP = "thermostand.guard_rules"
@@ -39,29 +36,19 @@ class GuardRule:
 
 
 def added_rule(name: str) -> GuardRule:
-    """The rule of that name; ValueError when no package adds it, or it cannot be loaded."""
-    for point in entry_points(group=GROUP, name=name):
-        package = point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
-        try:
-            rule = point.load()
-        except Exception as error:  # importing a stranger's module may raise anything
-            raise ValueError(f"{name}: {package} cannot be loaded ({error}); reinstall it") from error
-        if not isinstance(rule, GuardRule) or rule.name != name:
-            raise ValueError(f"{name}: {package} has no GuardRule of that name there; correct the package")
-        if GUARD + name not in KINDS:
-            guard_rule(name, rule.says, rule.advice)
-        return rule
-    known = ", ".join(sorted({point.name for point in entry_points(group=GROUP)})) or "none installed"
-    raise ValueError(f"no package adds a rule {name!r}; there are {known}")
+    """The rule of that name; ConfigError when no package adds it, or it cannot be loaded."""
+    rule = load_row(GROUP, name, GuardRule, "a rule")
+    if GUARD + name not in KINDS:
+        guard_rule(name, rule.says, rule.advice)
+    return rule
 
 
 def added_rules(data: object) -> object:
     """The settings of each, by its name; ValueError for what they do not take."""
     if not isinstance(data, Mapping):
         return data
-    given = cast("Mapping[str, object]", data)
+    given = cast("Mapping[str, Mapping[str, object] | None]", data)
     try:
-        return {name: added_rule(name).settings.model_validate(each or {}) for name, each in given.items()}
-    except ValidationError as error:
-        faults = (f"{path_text(each['loc'])}: {words(each)}" for each in error.errors())
-        raise PydanticCustomError("guard_rule", "{text}", {"text": "; ".join(faults)}) from error
+        return {name: check_settings(added_rule(name).settings, each or {}) for name, each in given.items()}
+    except ConfigError as error:
+        raise ValueError(str(error)) from error

@@ -15,7 +15,7 @@ from thermostand.experiments.validation import Validation, validation
 from thermostand.experiments.warm_up import WarmUp, warm_up
 from thermostand.experiments.written import Place, PlanError, StepEntries, Written, checked, unknown, written_steps
 from thermostand.foundation.documents import Document
-from thermostand.stand.config.added_experiments import added_names, added_steps, package_of
+from thermostand.stand.config.added_experiments import added_names, added_steps, adding_package
 
 _MADE_BY: Mapping[str, Callable[..., Iterable[Step]]] = {
     "warm_up": warm_up,
@@ -68,7 +68,7 @@ class Experiment(Document):
     @property
     def package(self) -> str:
         """The package that adds the entry's experiment, and its version; "" for our own."""
-        return package_of(self._added[0]) if self._added[0] else ""
+        return adding_package(self._added[0]) if self._added[0] else ""
 
     def sequence(self, place: Place = (), found: Situation | None = None) -> Generator[Written, None, None]:
         """The steps of this entry, which stands at `place`; found: what those before it leave."""

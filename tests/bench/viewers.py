@@ -129,7 +129,7 @@ def _frames(directory: Path) -> list[Figure]:
 
     async def begun(session: Path) -> None:
         """Viewers that come as soon as the run can be asked."""
-        script = "import time, sys\nfrom pathlib import Path\nfrom stand.serving.presence import living\n"
+        script = "import time, sys\nfrom pathlib import Path\nfrom thermostand.stand.serving.presence import living\n"
         script += "while not (found := [d for d in living() if d.entry.session == sys.argv[1]]): time.sleep(0.2)\n"
         script += "sys.argv[1] = str(found[0].socket)\n" + FOLLOW
         viewers.append(subprocess.Popen([sys.executable, "-c", script, str(session), str(VIEWERS)]))
