@@ -277,6 +277,7 @@ def _roles(path: Path, texts: list[str] | None) -> list[str] | None:
 
 
 _SPACING_mm = 1.0
+# A fit's own covariance is symmetric to rounding only; given back as it is, it has to be accepted.
 _ROUNDING = 1e-9
 
 

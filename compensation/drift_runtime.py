@@ -26,6 +26,8 @@ range, but not in this combination."""
 VERSION = 4
 """Of the JSON file. From thermostand 0.2.0 on each version reads the files of all before it."""
 
+# Half of it would leave 22 % of the guess, and twice would double the time after which a model without its own
+# `history_s` answers without a flag.
 SETTLED_TAUS = 3.0
 """After so many time constants a state that began with a guess has forgotten it (5 % are left)."""
 COLD_K = 3.0

@@ -44,18 +44,25 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
+# One lattice of weights serves 16 rows, which took 0.6 of the time of weights for each 16 pixels of a row.
 BLOCK_px = 16
 """Apart are the points of the lattice."""
 _PER_BLOCK = np.float32(1 / BLOCK_px)
+# Eight taps left 1.0, 0.37, 0.15 and 0.21 mpx of marker error at a blur of 0.5, 0.6, 0.8 and 1.2 px, for 1.4, 0.64,
+# 0.18 and 0.04 of a cubic B-spline, in 0.42 of its processor time. Twice the taps would take about twice the time.
 TAPS = 8
 _BEFORE = 3
 """Of the 8 pixels, those before the one at or left of the place."""
+# One blur serves all lenses: the errors above, at blurs of 0.5 to 1.2 px, are with this one.
 _BLUR_px = 0.7
+# Keeps the system solvable, and is too little to smooth the image.
 _NOISE = 1e-6
 _REACH = 1.0
 """How far a place may lie outside the two middle pixels, so that a block of places reads the same pixels."""
+# A step of the table is 0.003 px.
 _NODES = 1024
 _PER_NODE = np.float32(_NODES / (1 + 2 * _REACH))
+# Measured on 5 MP frames: 25.5 ms with 256 columns, 35 with 128 and 27 with 512.
 _STRIP = 256
 _HELD_ROWS = 128
 _HELD_BANDS = _HELD_ROWS // BLOCK_px

@@ -87,6 +87,8 @@ def _diagonal(blocks: Float) -> Float:
     return matrix.reshape(count * size, count * size)
 
 
+# Each distortion term may move the image's corner by about 5 % of its distance from the axis. Round number; it only
+# keeps terms finite that the markers do not determine.
 _LENS_PRIOR = 0.05
 _LENS_ORDERS = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])
 """Power of the radius that each distortion term is multiplied by, relative to the radius itself."""
@@ -257,6 +259,7 @@ def lens_sigma(lens: Pinhole) -> Float:
     return _LENS_PRIOR / corner ** _LENS_ORDERS[: len(lens.distortion)]
 
 
+# Round numbers; nothing was measured. With less travel camera and table cannot be separated.
 _LEAST_TURN_DEG = 5.0
 _LEAST_TRAVEL_MM = 10.0
 
@@ -296,11 +299,16 @@ def _places(linear_mm: Float, turns: Float, translations_mm: Float) -> tuple[Flo
     return found[:3], found[3:6] / np.linalg.norm(found[3:6]), found[6:]
 
 
+# A bound only: rounds end when the discrepancy and the outliers are settled.
 _ROUNDS = 10
+# Times the median of normal noise, and 6 sigma at the least. Round numbers; nothing was measured. Of normal noise one
+# marker in 6e7 lies beyond 6 sigma; beyond half of it one in 90 does, which is then dropped.
 _OUTLIER = 8.0
 _LEAST_OUTLIER_SIGMA = 6.0
 _MEDIAN_LENGTH = 1.18
 """Of a vector of two coordinates of unit variance."""
+# With more than 2 % beyond, nothing is dropped: that is no set of stray markers but a wrong target or a wrong order.
+# Round number; nothing was measured.
 _MOST_OUTLIERS = 0.02
 _CLOSE_TO_ONE = 0.02
 

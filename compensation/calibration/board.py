@@ -48,6 +48,8 @@ def board_of(target: Target) -> Board:
 Project = Callable[[Float], Float]
 """Points (..., 3) of the camera frame, mm -> pixels (..., 2)."""
 
+# With the radius below the polygon has the disc's second moment exactly; the number of points only affects higher
+# orders.
 _OUTLINE_POINTS = 32
 _OUTLINE_RADIUS = float(np.sqrt(3 / (2 + np.cos(2 * np.pi / _OUTLINE_POINTS))))
 """Of the polygon over the disc's: both then have the same second moment over area, which is what moves the centroid."""

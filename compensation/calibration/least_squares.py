@@ -19,6 +19,7 @@ from thermostand.foundation.errors import CalibrationError
 Float = NDArray[np.float64]
 State = TypeVar("State")
 
+# A bound only: a fit that takes as many steps does not converge.
 _STEPS = 200
 _FIRST_DAMPING = 1e-6
 _GREATEST_DAMPING = 1e8

@@ -20,6 +20,7 @@ from thermostand.compensation.calibration.pinhole import Pinhole
 from thermostand.foundation.errors import CalibrationError
 
 DEGREES = (3, 4, 5)
+# A bound only: Newton's steps end when they are below _PROJECTED_PX.
 _PROJECTIONS = 20
 _PROJECTED_PX = 1e-9
 

@@ -26,6 +26,8 @@ from thermostand.foundation.errors import CalibrationError
 
 LEAST_COMMON = 3
 """Moments at which a camera and the first one both see the board: one fixes it, the others find mistakes."""
+# Cameras that are fixed to each other turn by far less between moments; half-turned names of a symmetric target give
+# 180 degrees.
 _GREATEST_PLAY_DEG = 5.0
 _ROUNDS = 10
 _SETTLED = 0.02

@@ -102,8 +102,10 @@ POSE = 6
 """Parameters of a view: a turn (rad) and a shift (mm), in the camera's frame."""
 LEAST_VIEWS = 5
 LEAST_MARKERS = 12
+# Round number; nothing was measured. With less tilt the focal length cannot be separated from the distance.
 _LEAST_TILT_DEG = 10.0
 _ROUNDS = 10
+# One in 10^7 markers of normal noise lies beyond 6 sigma in two coordinates; half of it would drop one in a hundred.
 _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
 _SETTLED = 0.02

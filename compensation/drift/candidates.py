@@ -14,6 +14,7 @@ from thermostand.foundation.documents import Document
 
 Pair = tuple[float, float]
 
+# With two the variance has one degree of freedom, for which Student's factor is 6.5.
 FEWEST_BETWEEN = 3
 NO_MATTER_PX = 0.0005
 """Worse by less than anybody measures."""

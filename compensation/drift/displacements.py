@@ -14,6 +14,7 @@ from thermostand.compensation.observations import Float, Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
 
+# The mean of 20 frames has 0.22 of the noise of one; of 10 it has 0.32, of 40 0.16.
 _ANCHOR_FRAMES = 20
 
 

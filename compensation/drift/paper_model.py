@@ -123,6 +123,7 @@ def _triangle(rows: Float) -> Float:
     return cast(Float, np.linalg.qr(rows, mode="r"))  # for this mode numpy's stubs promise a pair
 
 
+# Chebyshev products keep the condition number below 200 at degree 5, where raw pixels and degrees give 8e19.
 MAX_DEGREE = 5
 
 

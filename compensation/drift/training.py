@@ -19,7 +19,9 @@ from thermostand.foundation.errors import SessionError
 
 Index = NDArray[np.int64]
 
+# A fit inverts matrices of as many rows as there are instants: half of it would take up to eight times as long.
 INSTANT_NS = 240 * NS_PER_S
+# Without it the evidence blows up on drawn cameras (16 of them, numbers 3000 on).
 _FLOOR_PX = 0.002
 """What no model of this kind explains is common to all markers of an instant: many frames at one temperature (a
 warm-up has thousands) do not outweigh one frame at each of many."""

@@ -116,10 +116,12 @@ TimesNs = NDArray[np.int64]
 _STEP_NS = 10 * NS_PER_S
 """How far the state is moved at once: the inputs' means over it are exact, and the fastest lag takes minutes."""
 
+# In factors of about three; their weights are fitted to each session.
 _SHAPE_TAUS_S = (40.0, 150.0, 480.0, 1200.0, 4000.0)
 _SHAPE_RIDGE = 1e-10
 _FINE_K, _ROUNDING_K = 0.02, 1e-6
 """A display finer than this needs no refinement; readings closer together than that are the same."""
+# Twelve terms are fitted to them. Round number; nothing was measured.
 _FEWEST_READINGS = 200
 _CHANGE_NS = 30 * NS_PER_S
 """Two readings further apart do not show when the display changed."""

@@ -135,6 +135,7 @@ def _sent(visit: TableVisit) -> tuple[float, float]:
 
 # How far the target at V0, V1, ... seems to have moved since the reference temperature.
 
+# It was one third until a fitted model's errors were seen to be alike over half of the image.
 _CORRELATED = 1 / 2
 """Of the image's width: over this distance errors of a drift model are taken to be alike."""
 
