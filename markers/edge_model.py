@@ -42,6 +42,8 @@ other rows of `Pixels.table`."""
 ROWS = PARAMETERS + 7
 _TINY, _ZERO, _HALF, _ONE = np.float32(1e-12), np.float32(0), np.float32(0.5), np.float32(1)
 _TABLE_END = np.float32(6)
+# With a series of second order between the nodes 8 kB give what 128 kB gave with linear interpolation, and they stay in
+# the nearest cache.
 _CELLS = 1024
 _PER_CELL = np.float32(12 / _CELLS)
 _CELLS_PER = np.float32(_CELLS / 12)

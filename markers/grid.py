@@ -34,6 +34,8 @@ from thermostand.markers.target import DonutMarkers, OddMarker, Target
 
 # The ways a target lies over a lattice grown through the candidates.
 
+# A missing marker counts as so much residual. In rendered clutter the choice by residual found 8 of 10 targets and none
+# wrong, that by the number of markers 4 of 10 and one wrong.
 _MISSING_PX = 0.5
 _FEWER_THAN_BEST = 2
 LEAST_SEEN = 6
@@ -44,6 +46,7 @@ when those have gone."""
 _BEYOND_CELLS = 2
 _REACH = 0.35
 _WORTH_SETTLING = 0.7
+# Tighter than the gate of 0.2 behind it.
 _RANSAC_PITCH = 0.12
 _QUARTER_TURN = np.array([[0, 1], [-1, 0]])
 _SHEARS = tuple(np.array(shear) for shear in ([[1, 1], [0, 1]], [[1, -1], [0, 1]], [[1, 0], [1, 1]], [[1, 0], [-1, 1]]))
@@ -304,6 +307,8 @@ __all__ = [
     "roll_deg",
 ]
 
+# Another placement within this factor of the best is a refusal, not a guess: of ten rendered scenes with clutter two
+# were refused and none was wrong.
 _AMBIGUOUS_RESIDUAL = 1.5
 _AMBIGUOUS_ROLL_DEG = 30.0
 _TRACKED_PITCH = 0.5

@@ -16,6 +16,7 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 _DEPTHS_bit = (8, 10, 12, 14, 16)
+# Round number; nothing was measured.
 _BINS = 16
 _LEAST_PIXELS = 1000
 _EDGE_px = 7

@@ -27,6 +27,7 @@ U, V, VALUE, SHARE, RESIDUAL, RISE = range(6)
 the pixel; then what the model writes: residual over its standard deviation, and how it changes per px that the outline
 moves."""
 
+# Round number; nothing was measured.
 CLIPPED_PART = 0.25
 _ROWS = 6
 _PARTS = np.array([GROUND, CORE, DISC, -1, DISC, CORE, GROUND])

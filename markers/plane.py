@@ -13,6 +13,7 @@ from thermostand.markers.target import Target
 
 _LEAST_FOR_DEGREE = {5: 80, 3: 20}
 """A polynomial of this degree needs so many markers: about four for each coefficient, or two for the cubic."""
+# Without a test of convergence: the bend is needed to a part of the place tolerance only.
 _ROUNDS = 8
 _NOT_FLAT = "the spots found cannot be the markers of a flat target"
 _SIGMA_OF_MEDIAN = 1 / np.sqrt(2 * np.log(2))

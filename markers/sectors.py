@@ -14,6 +14,7 @@ from thermostand.markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE
 Bools = NDArray[np.bool_]
 Sectors = NDArray[np.int32]
 
+# Ten degrees of the outline each; what is set aside is whole sectors.
 SECTORS = 36
 _QUADRANT = SECTORS // 4
 _BLOCK = 256

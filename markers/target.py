@@ -21,6 +21,7 @@ from pydantic import Field, model_validator
 
 from thermostand.foundation.documents import Document, load_document
 
+# A print is off by hundredths of a pitch, a wrong order by a whole one. Round number; nothing was measured.
 _CMM_TOLERANCE = 0.25
 """A measured centre further than this part of the pitch from its nominal place means a wrong order or a wrong unit."""
 

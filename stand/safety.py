@@ -17,6 +17,7 @@ from thermostand.foundation.events import CONFIRMED_SAFE, NOT_CONFIRMED_SAFE
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.tasks import first_of
 
+# Below the 15 s of the relay board's own timer.
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
 _PAUSE_S = 1.0  # between tries
 _REPORTED_AFTER_S = 60.0

@@ -37,8 +37,11 @@ from thermostand.stand.config.stand_config import CompressorConfig
 _EARLY_S = 1.0  # a relay that is off so shortly before its time may just have dropped by itself
 
 # The self-test of the dead-man, in units of self_test_s / 3: armed, armed again, must be on, must be off.
+# On a computer with two busy loops commands came more than 1 s late, and a board that does not re-arm passed: so each
+# command's instants are compared, and a late test is repeated.
 _AGAIN, _STILL_ON, _OFF, _PULSE = 2.0, 4.0, 6.5, 3.0
 _LOOK = 0.05  # between looks of a test that is timed
+# Three were not enough on a busy computer; a late try says nothing of the board.
 _TEST_TRIES = 5  # of that test, when this computer is held up in it
 
 

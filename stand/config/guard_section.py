@@ -42,6 +42,7 @@ class SensorsConfig(Document):
 
     warn_K: float = Field(default=3.0, gt=0, le=20)
     warn_after_s: float = Field(default=600.0, ge=0, le=3600)
+    # Half of it would trip on a ramp at full power, and twice lets one of the two be wrong by 12 K.
     trip_K: float = Field(default=6.0, gt=0, le=20)
     trip_after_s: float = Field(default=120.0, ge=0, le=3600)
     jump_K: float = Field(default=2.0, gt=0, le=50)
@@ -69,15 +70,19 @@ class GuardConfig(Document):
     """
 
     period_s: float = Field(default=1.0, gt=0, le=10)
+    # Fifteen kelvins below what the chamber survives.
     max_air_degC: float = Field(default=65.0, le=80)
     max_granite_degC: float = Field(default=60.0, le=80)
     max_camera_degC: float = Field(default=85.0, le=100)
     stale_after_s: float = Field(default=15.0, gt=0, le=120)
+    # With all software gone the relay board ends the heat after this: 8 Wh at 2 kW, 0.6 K of a chamber of 13 Wh/K.
     heater_hold_s: float = Field(default=15.0, ge=2.0, le=60.0)
     heater_renew_s: float = Field(default=5.0, gt=0)
     heater_off: HeaterOffConfig = HeaterOffConfig()
     cooling: CoolingConfig = CoolingConfig()
     sensors: SensorsConfig = SensorsConfig()
+    # Sessions of drawn chambers with large steps within an hour took 1413 to 1416 Wh, which trips. Half of it would
+    # trip on good ones, and twice is more than 2 kW can give.
     heat_max_Wh_per_h: float = Field(default=1400.0, gt=0, le=20_000)
     heat_balance: HeatBalanceConfig = HeatBalanceConfig()
     granite_crosscheck: GraniteCrosscheckConfig = GraniteCrosscheckConfig()

@@ -33,6 +33,8 @@ SENSOR_IMPLAUSIBLE = guard_rule(
 )
 Poll = tuple[Reading, ...]
 
+# Half of it is less than a step of the recipes, and would doubt a body after a gap; twice lets a jump in a gap pass
+# that is twice as large.
 _DRIVE_K = 50.0
 """How far from a body its surroundings, or its own heat, may draw it: the largest step of the installed recipes is 36 K
 and the warmest camera 25 K above the air. In a gap a body of lag L can go no further than 1 - exp(-gap / L) of it."""
@@ -47,11 +49,13 @@ _SLOW_S = 100.0  # a body with at least this lag cannot run away within a minute
 _WINDOW_S = 60.0  # over which a slow body's rate is looked at
 _TREND_S = (4.0, 20.0)  # between the readings of which a trend is made
 _TREND_K = 4.0  # that a trend may promise: full heat makes up to 0.5 K/s in the smallest of the drawn chambers
+# Half of 1 K is still 25 times what good sessions have; twice would not find a noise of 1 K.
 _NOISE_POLLS, _NOISE_K = 12, 1.0
 """The median of second differences: 0.02 K in good nights, 1.65 K with a noise of 1 K (standard deviation)."""
 _TOGETHER_S = 15.0  # what moves within this, on other devices, moved with it
 _BACK_S = 1800.0  # for so long a channel must be as far from the one that it follows as it was before it jumped
 _STILL_K = 2.0  # air that stays within this is at rest, as far as a camera notices
+# 5 % of a step are left then, 22 % after half of it.
 _REST_LAGS = 3.0  # after so many lags in air at rest a camera is at rest, too
 _REST_K, _OWN_REST_LAGS = 1.0, 2.0
 """A camera that stayed within so much for so many of its configured lags has warmed up: the lag is a guess, and one of
@@ -60,6 +64,7 @@ _STEPS_BEHIND, _SLOWER, _FINE_STEP_K, _YOUNG_LAGS = 5.0, 3.0, 0.2, 10.0
 """Steps of a display that a camera must have gone before it counts as stuck, with up to three times its configured lag.
 One coarser than 0.2 K needs more, in proportion, while it may still warm up: of 260 drawn nights one had a camera in
 steps of 0.5 K that stood still for 35 min while its own heat and air that fell by 18 K balanced each other."""
+# Half of it leaves 0.5 K above the 2.5 K of radiation and granite.
 _EXCESS_K = 6.0  # from rest to rest: radiation and the granite make up to 2.5 K of it between -10 and 60 degC
 _SAME_K = 1e-6  # a rounding, no step of a display
 

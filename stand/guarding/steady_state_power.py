@@ -18,6 +18,7 @@ OUTPUT_NOT_AS_NEEDED = guard_rule(
 )
 _FLAP_OPEN_ABOVE = 0.05
 _BAND_K, _MEAN_S = 2.0, 300.0  # at its set-point; the cycles of a relay's output are a minute
+# In proportion, set-points twice as far apart differ by 20 %, close to the limit of 25.
 _NEAR_K = 3.0  # a set-point so near needs the same within 10 % in good nights
 _LEARNING = 0.25  # share of a new mean; the first is taken whole
 

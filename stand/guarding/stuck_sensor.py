@@ -15,6 +15,7 @@ from thermostand.stand.guarding.plausibility import Scatter, remembering
 SENSOR_STUCK = guard_rule("sensor_stuck", "a temperature stays exactly where it is while it must move", SENSOR)
 FINE_STEP_K = 0.02
 """A converter in steps as fine moves by its own noise at every poll or two; one of 0.1 K may stand still for hours."""
+# At a poll a second 300 equal readings, of a converter that rests for a poll or two.
 _FROZEN_S = 300.0
 _STUCK_S, _MOVED_K = 60.0, 1.0  # a probe in steps of 0.1 K follows within seconds what moves the air by so much
 
