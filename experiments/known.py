@@ -27,6 +27,7 @@ from thermostand.experiments.steps import (
 )
 
 MOST_VISITS = 200
+# A held-out visit after each third one. Round number; nothing was measured.
 _VALIDATED_AFTER = 3
 
 

@@ -351,6 +351,8 @@ class StopChamber(Step):
         await stand.chamber.stop()
 
 
+# A soak is judged by its last third, at most 10 min of it, and lasts at most twice its time: a chamber that is too weak
+# for a set-point still gives a session, whose frames say so.
 _LAST_PART, _LONGEST_LAST_S, _LIMIT = 1 / 3, 600.0, 2.0  # of a soak's time
 _OPEN_S = 60.0  # of a soak through an open flap: the laboratory's air comes in
 
@@ -764,6 +766,8 @@ class PowerCamera(Step):
         await stand.imaging.power_camera(on=self.on)
 
 
+# The warmest camera of the published ones is 25 K above the air; an error of two changes a cool-down's estimate by 0.7
+# of a time constant.
 _CAMERA_EXCESS_K = 20.0  # of a camera that has been on for an hour, over the air around it
 COOL_DOWN_AS_FOUND = "cool down as found"  # of a camera that the run finds as warm as it happens to be
 
@@ -865,6 +869,7 @@ class Prompt(Step):
         await stand.prompt(self.text)
 
 
+# An estimate only, for the time that is left; what a decision takes is measured as the run goes on.
 _DECIDE_S = 10.0
 
 

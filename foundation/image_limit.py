@@ -6,6 +6,8 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+# An array of floats of it has 280 MB, so that a command stays below 1.5 GB; `compensate detect --max-megapixels` lifts
+# it.
 GREATEST_MEGAPIXELS = 70.0
 _greatest_megapixels = ContextVar("greatest_megapixels", default=GREATEST_MEGAPIXELS)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+# Limits of their own, one for each wait, added up to 7 s when a disk hung.
 BUDGET_S = 3.0  # real seconds, of the 5 within which a daemon leaves once its stand is safe
 LEAST_S = 0.1  # for each wait, though another one has used the budget up: a disk that works needs no longer
 

@@ -17,6 +17,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import KINDS, EventKind, must_be_heard, state_of
 from thermostand.foundation.items import Event
 
+# Round numbers; nothing was measured.
 FIRST, PERIOD_NS = 3, 1200 * NS_PER_S
 """The first three at once, then one each 20 minutes that counts those between: at most six in any hour."""
 _MOST_KEPT = 1000  # sentences: one that has been quiet for an hour is forgotten, and with this many the oldest is

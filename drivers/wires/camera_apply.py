@@ -24,7 +24,9 @@ PACKET_DELAY_TICKS = 0x0D08
 
 # Wider than any sensor's quantisation (line time, 0.1..0.36 dB steps), narrower than a clamped value.
 EXPOSURE_TOLERANCE, EXPOSURE_TOLERANCE_S = 0.01, 50e-6
+# Cameras take gains in steps of their own. Round number; nothing was measured.
 GAIN_TOLERANCE_DB = 0.5
+# Round number; nothing was measured.
 FRAME_RATE_TOLERANCE = 0.02
 
 LEAST_HEARTBEAT_S = 1.2  # Aravis asks each second

@@ -7,6 +7,7 @@ from thermostand.foundation.clock import NS_PER_S
 # IEEE 802.3 around each IP packet: preamble 8, header 14, check sequence 4 and gap 12 bytes.
 ETHERNET_BYTES = 38
 GVSP_BYTES = 28 + 8  # IP, UDP and GVSP header within a packet (GigE Vision 1.2, section 21)
+# One packet of each other camera and a tenth, so that no switch has to store more than a few.
 _MARGIN = 1.1  # packets of the control channel, and senders that are not quite even
 
 

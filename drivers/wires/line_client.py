@@ -14,6 +14,7 @@ from thermostand.foundation.errors import GarbledReply, Unreachable
 
 Answer = TypeVar("Answer")
 
+# As the Modbus bus: longer than a late reply may still take. Round number; nothing was measured.
 _MARGIN_S = 0.05
 _LONGEST_REPLY = 65536
 READ_RETRIES = 2

@@ -74,6 +74,8 @@ class XimcClient:
             if link.read(0.0).strip(b"\0"):  # unrequested, and more may follow
                 self.errors += 1
                 self._resync(link)
+            # Answers carry no number; a controller echoes zeros one for one and in order, so what comes before the echo
+            # is old.
             link.write((b"" if self._echoes is False else _MARK) + encode(letters, payload))
             frame, rest, is_marked = self._receive(link, letters, reply_size)
             if (

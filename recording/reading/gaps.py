@@ -23,6 +23,7 @@ from thermostand.foundation.instants import duration
 from thermostand.foundation.items import Event
 from thermostand.recording.format.utc_offsets import UtcOffsets
 
+# At 1 Hz up to four missed polls are no hole. Round numbers; nothing was measured.
 SHORTEST_NS = 5 * NS_PER_S
 MEDIANS = 3
 _LAST_BLOCK = 2**62

@@ -10,6 +10,7 @@ from thermostand.foundation.clock import NS_PER_S
 Instants = NDArray[np.int64]
 Float = NDArray[np.float64]
 
+# Four polls of the slowest device that is read each 30 s. Round number; nothing was measured.
 GAP_NS = 120 * NS_PER_S
 """Readings further apart than this say nothing of the time between them."""
 

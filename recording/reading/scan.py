@@ -74,6 +74,7 @@ Report = Callable[[float, str], None]
 NO_TEMPERATURE = "no frame has a good camera temperature"
 CAPTURE = "capture"
 # The journal may be ahead of telemetry that waits for its next commit, on a virtual clock for 20 s.
+# Three commits of virtual time; a journal that is further ahead has lost telemetry.
 AHEAD_NS = 60 * NS_PER_S
 _LAST = 2  # segments of the telemetry: a run's end is recorded before its stand is safe, which may take ten minutes
 

@@ -214,6 +214,8 @@ def _times(one: int, other: int) -> int:
 # the begin is inflated. When even so false claims have cost many times the size, nothing more is believed: the damaged
 # place goes to the end of the file, and the salvage keeps the original.
 
+# Beyond it and the size of the file a claim is believed only where a CRC or a good begin speaks for it, so that a file
+# made to claim many records takes time in proportion to its size.
 _FREE_BYTES = 1 << 24  # more than what any damage of a disk makes false in a small file
 _LIMIT_BYTES, _LIMIT_FACTOR = 1 << 28, 16
 _SMALL_BYTES = 1 << 13  # of a record that are read in any case, where no CRC can be compared

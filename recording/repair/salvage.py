@@ -198,6 +198,7 @@ def _size(path: Path) -> int:
 
 
 BEING_RECORDED = "is being recorded"
+# Telemetry is small and read often: zstd's usual level. Frames are as the recorder writes them.
 LEVELS = {FRAMES: ZSTD_LEVEL, TELEMETRY: 3}  # of zstd
 
 

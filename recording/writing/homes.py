@@ -36,6 +36,8 @@ class Home:
             found = self._folder.stat()
         except (FileNotFoundError, NotADirectoryError):
             found = None
+        # By device and inode, since a folder of the same name may be another one: a removed one must not be made again
+        # silently.
         if found is None or not os.path.samestat(found, os.fstat(self._fd)):
             raise FolderLost(errno.ENOENT, f"the folder {self._folder} {self._fate()}")
 

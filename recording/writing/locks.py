@@ -13,6 +13,7 @@ from pathlib import Path
 
 from thermostand.recording.writing.disk import MODULE
 
+# Round number; nothing was measured.
 _LEFT_WITHIN_S = 2.0
 _AGAIN_S = 0.02
 

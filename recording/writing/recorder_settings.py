@@ -20,6 +20,7 @@ class RecordingSettings:
     frame_encoding: FrameEncoding = "zstd"
     telemetry_commit_s: float = 1.0
     segment_bytes: int = 1_000_000_000
+    # Round numbers; nothing was measured.
     segment_s: float = 600.0
     queue_frames: int = 20
     waiting_messages: int = 200_000
@@ -28,4 +29,5 @@ class RecordingSettings:
 
 
 USUAL = RecordingSettings()
+# At 427 times real time it is 50 ms of the host's; a commit each second would be a disk sync for each second of a run.
 VIRTUAL_COMMIT_S = 20.0  # between commits on a virtual clock: well under a second of the host's

@@ -50,12 +50,15 @@ from thermostand.recording.format.messages import frame_table
 from thermostand.recording.writing.mcap_writer import McapWriter
 from thermostand.recording.writing.notices import disk_space
 
+# A telemetry segment of ten minutes has 600 chunks of a second's commit each; merged it is read three times as fast.
 MANY_CHUNKS = 32  # opening a chunk takes a reader as long as a dozen messages
 FILE_SYSTEM_BYTES = 1_000_000  # never reserved: the file system needs blocks of its own to hold a reserve
 CHUNK_BYTES = 1024 * 1024
 _KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE, linux/falloc.h
 _NO_RESERVE = (errno.EOPNOTSUPP, errno.ENOSYS)  # a file system that cannot reserve is written to without
 _PARTS_AT_ONCE = 1024  # IOV_MAX
+# With it a raw frame takes 2.9 ms, in one write 3.6, the bare system calls 2.9. Written with its CRC behind the data, a
+# killed write would leave a hole in front, which counts as damage and not as an unfinished block.
 _PIECE_BYTES = 1 << 19  # of 128 KiB to 8 MiB the fastest for frames of 5 MB
 _BEGIN_WRITING = 2  # SYNC_FILE_RANGE_WRITE, linux/fs.h: the disk is given what is there, and nobody waits for it
 

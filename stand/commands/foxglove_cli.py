@@ -14,6 +14,7 @@ from thermostand.stand.commands.reached import on_stand
 from thermostand.stand.serving.client import Server
 
 app = App()
+# As often as the daemon makes a snapshot.
 _LOOK_S = 0.5
 
 

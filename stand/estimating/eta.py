@@ -17,6 +17,7 @@ from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.stand.estimating.estimate import PricedStep
 from thermostand.stand.gate import HELD, RELEASED
 
+# Round numbers; nothing was measured.
 _REMEMBERED = 9  # the last measurements of a kind of work count
 _LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
 _LEAST_WITHIN_S = 60.0

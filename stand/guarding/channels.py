@@ -33,7 +33,7 @@ SENSOR_IMPLAUSIBLE = guard_rule(
 )
 Poll = tuple[Reading, ...]
 
-# Half of it is less than a step of the recipes, and would doubt a body after a gap; twice lets a jump in a gap pass
+# Half of it is less than a step of the recipes, and would suspect a body after a gap; twice lets a jump in a gap pass
 # that is twice as large.
 _DRIVE_K = 50.0
 """How far from a body its surroundings, or its own heat, may draw it: the largest step of the installed recipes is 36 K

@@ -39,6 +39,7 @@ class FollowingBody:
     """A body that follows `air` with a lag. It begins as warm as the air may have been before anybody looked, so that
     an error of the begin excuses too much and never too little; unknown air leaves it as it is."""
 
+    # An error of the begin excuses too much for about two hours; it never trips a good session.
     def __init__(self, air: str, lag_s: float, warmest_degC: float) -> None:
         self._air = air
         self._lag_s = lag_s

@@ -378,6 +378,8 @@ class Daemon(Host):
             may_begin = not (self.has_guest or self._orders.leaving)
             if may_begin:
                 self._status.tell(self.by_hand.doing)
+            # Its disk process holds the queue's lock and what the compressor did; a new one would have to take both
+            # while calls still wait for the old one. The service starts the daemon again.
             if may_begin and self.open_stand.disk is not None and (ended := self.open_stand.disk.ended):
                 raise SessionError(f"{ended}; neither queue nor what the compressor did can be kept without it")
             if may_begin and self._is_midnight():

@@ -289,6 +289,8 @@ class ThermalImager:
             self._offset_s, self._late = min(self._offset_s, lag_s), None
             return []
         apart_s = 2 * self._settings.poll_s + 1.0
+        # One late picture may be an old one that somebody copied into the folder; only two in a row show a clock set
+        # back.
         if self._late is None or abs(lag_s - self._late[1]) > apart_s:
             self._late = first_ns, lag_s
         if first_ns - self._late[0] <= seconds_ns(apart_s):

@@ -51,6 +51,7 @@ _ERROR_NAMES = (
     "serial protocol error", "serial time-out", "hard over-current",
 )  # fmt: skip
 
+# The drive reports no jam by itself: its duty is saturated and its feedback still, for JAM_S.
 _JAM_DUTY = 0.9  # of the configured maximum
 POLL_S = 0.05
 CONFIRMATIONS = 3

@@ -32,6 +32,7 @@ _MICROSTEP_MODE_256 = 9
 _POLL_S = 0.1
 _STOP_LIMIT_S = 2.0
 _HOME_LIMIT_S = 900.0  # the slowest profile crosses its whole travel at 100 steps/s
+# One full step: a stepper that has slipped is off by four.
 _ARRIVED_MICROSTEPS = 256
 
 # GETS: MoveSts, MvCmdSts, PWRSts, EncSts, WindSts, CurPosition, uCurPosition, EncPosition, CurSpeed, uCurSpeed, Ipwr,

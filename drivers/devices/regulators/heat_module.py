@@ -22,9 +22,11 @@ from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
 from thermostand.foundation.readings import Channel, Quality, Reading
 
+# 0.6 % of the heat; one that reads back otherwise twice heats by a law of its own, and loses the relay in series.
 _TOLERANCE_mA = 0.1  # of what reads back: the modules are good to 0.02 mA
 _TOLERANCE_s = 0.05  # of its watchdog's time, which it keeps in tenths
 _CHECKED_EVERY_S = 10.0  # that it would still end the heat by itself
+# Whether a plain request keeps a module's watchdog alive is nowhere documented, so each run tests it.
 _TESTED = 1.5  # watchdog_s, for which it is left alone, and then written to
 _WATCHDOG, _TRIPPED, _TIME = "watchdog_on", "tripped", "watchdog_s"
 

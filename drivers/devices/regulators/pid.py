@@ -38,6 +38,8 @@ class Law(Document):
     derivative_set_point_weight: float = Field(default=0.0, ge=0, le=1)
     derivative_filter: float = Field(default=8.0, ge=1, le=100)
     tracking_s: float | None = Field(default=None, gt=0, le=100_000)
+    # An approach of three ultimate periods, chosen in the standard chamber and judged in ten drawn ones, overshoots by
+    # 0.03 K; none at all by 1.5 K.
     approach_s: float | None = Field(default=600.0, gt=0, le=100_000)
     set_point_K_per_min: float | None = Field(default=None, gt=0, le=60)
     lowest_percent: float = Field(default=-15.0, ge=-100, le=0)

@@ -32,6 +32,7 @@ from thermostand.drivers.devices.regulators.pid import Law
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.documents import Document
 
+# Round numbers; nothing was measured.
 _PERIODS = 4  # that have to agree
 _AGREE = 0.2  # each with their mean: amplitude and period; and the shares with one half
 _LEAST_PERCENT = 2.0  # amplitude of the output with which a limit cycle is still above the noise

@@ -33,6 +33,8 @@ from thermostand.stand.serving.desk import Done, PlanCheck, PlanStep, StandState
 _REFRESH_S = 0.5
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
 _FRESH_S = 0.3  # so long one who asks for the state waits for a new one
+# The thread is never waited for: what it has not taken of so many items is dropped for viewers, never for the
+# recording.
 _QUEUE = 20_000  # items, which are some MB; the thread takes them four times a second at the least
 _PLAN_AGE_S = 5.0  # what a plan has earned and expects changes slowly; the begin or end of a step is shown at once
 _STOPPED_S = 0.1  # between two stops, from any client: a flood must not fill the recording

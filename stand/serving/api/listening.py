@@ -25,6 +25,7 @@ MOST_CLIENTS = 64
 _UNREAD = 10  # looks, one a second, at an answer that is not read
 _FAREWELL_LIMIT_S = 1.0  # for clients that do not read their last answer
 # A browser answers a ping each 20 s with 10 bytes. A read counts as 64 bytes at least: eight a second, 64 at once.
+# Without a limit a viewer that talks is never sent away.
 _VIEWER_BYTES_PER_S, _VIEWER_BURST_BYTES, _LEAST_BYTES = 512, 4096, 64
 _BACKLOG = 4096  # who finds no place in it is tried again by the kernel after 1 s
 

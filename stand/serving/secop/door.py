@@ -28,6 +28,7 @@ from thermostand.stand.serving.secop.secop_lines import (
 )
 
 HOST = "127.0.0.1"  # the protocol knows neither user nor password: others come through a tunnel of theirs
+# Round numbers; nothing was measured.
 MOST_CLIENTS = 16
 _MOST_WAITING = 64  # requests of a client
 _MOST_ANSWERS = 256  # that a client has not read
