@@ -43,7 +43,7 @@ nightly: setup
 bench: setup
 	$(BIN)/python -m tests.bench
 
-# METHOD=my_method.py scores one more, see docs/benchmark.md.
+# METHOD=my_method.py scores one more, see docs/explanation/benchmark.md.
 benchmark: setup
 	$(BIN)/python -m tests.benchmark $(METHOD)
 

@@ -1,32 +1,196 @@
-"""Pages that are made when the site is: the references of the configuration files, from their schemas, and what a stand
-says, from its table of events."""
+"""Pages that are made when the site is built, each from the one place that defines what it lists.
+
+A page is either made whole (the files' references, from their schemas) or has a line `<!-- made: NAME -->`, which is
+replaced by what the function of that name gives: the steps, the events, the commands, the routes, the model file.
+"""
 
 from __future__ import annotations
 
+import base64
 import json
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
+from pydantic import TypeAdapter
+from typer.main import get_command
 
+from thermostand.compensation.cli import app as compensate
+from thermostand.compensation.drift.model_file import PaperFile, ThermalFile
+from thermostand.experiments.steps import STEPS, Step
+from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.commands.remedies import troubleshooting
 from thermostand.stand.config.reference import reference
 
-_PAGES = {
-    "stand": "A stand's file",
-    "recipe": "A recipe",
-    "registers": "A register map",
-    "target": "A target",
-    "geometry": "A stand's geometry",
-    "details": "Details of a measurement",
+ROOT = Path(__file__).parents[1]
+SCHEMAS = ROOT / "configs" / "schema"
+OPENAPI = ROOT / "tests" / "golden" / "data" / "openapi.json"  # a test holds that it is what a stand answers
+NOTEBOOK = ROOT / "docs" / "tutorials" / "simulated-session.ipynb"
+FILES = {
+    "stand": ("stand-file", "A stand's file"),
+    "recipe": ("recipe-file", "A recipe"),
+    "registers": ("register-map", "A register map"),
+    "target": ("target-file", "A target"),
+    "geometry": ("geometry-file", "A stand's geometry"),
+    "details": ("details-file", "Details of a measurement"),
 }
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add a page for each schema."""
-    schemas = Path(__file__).parents[1] / "configs" / "schema"
-    for name, title in _PAGES.items():
-        schema = json.loads((schemas / f"{name}.json").read_text(encoding="utf-8"))
-        files.append(File.generated(config, f"reference-{name}.md", content=reference(title, schema)))
-    files.append(File.generated(config, "troubleshooting.md", content=troubleshooting()))
+    """Add a page for each schema, and the notebook as it was last executed."""
+    for name, (page, title) in FILES.items():
+        schema = json.loads((SCHEMAS / f"{name}.json").read_text(encoding="utf-8"))
+        files.append(File.generated(config, f"reference/{page}.md", content=reference(title, schema)))
+    if not NOTEBOOK.exists():
+        return files
+    text, pictures = executed(json.loads(NOTEBOOK.read_text(encoding="utf-8")))
+    files.append(File.generated(config, "tutorials/notebook.md", content=text))
+    for name, data in pictures.items():
+        files.append(File.generated(config, f"tutorials/{name}", content=data))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill in what is made, and write equations as MathML, which browsers draw by themselves."""
+    markdown = re.sub(r"<!-- made: (\w+) -->", lambda found: MADE[found[1]](), markdown)
+    return re.sub(r"```math\n(.*?)\n```", lambda found: convert(found[1], display="block"), markdown, flags=re.DOTALL)
+
+
+def executed(notebook: Any) -> tuple[str, dict[str, bytes]]:
+    """A notebook as Markdown, and the pictures that it shows, by their names."""
+    lines, pictures = list[str](), dict[str, bytes]()
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"])
+        lines += [source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```", ""]
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if "image/png" in data:
+                name = f"notebook-{len(pictures) + 1}.png"
+                pictures[name] = base64.b64decode("".join(data["image/png"]))
+                lines += [f"![What the cell above draws]({name})", ""]
+            else:
+                text = "".join(output.get("text", data.get("text/plain", ""))).rstrip()
+                lines += ["```text", text, "```", ""]
+    return "\n".join(lines), pictures
+
+
+def steps() -> str:
+    """Each kind of step that a recipe can name: what it does, and its keys."""
+    return "\n".join(line for kind in STEPS.values() if kind.in_recipes for line in _step(kind))
+
+
+def _step(kind: type[Step]) -> Iterator[str]:
+    yield from (f"## {kind.kind}", "", _paragraphs(kind.__doc__ or ""), "")
+    yield "Restored after an interruption." if kind.is_setup else "Done once; work that was interrupted is done again."
+    if kind.form is None:
+        yield from ("", f"Written as `- {kind.kind}`, with nothing behind it.", "")
+        return
+    schema = TypeAdapter(kind.form).json_schema(mode="validation")
+    table = reference("", schema).partition("\n\n")[2]
+    if "properties" in schema:
+        yield from ("", table)
+        return
+    models = [model for model in schema.get("$defs", {}).values() if "properties" in model]
+    for model in models:
+        yield from ("", reference("", model).partition("\n\n")[2])
+    if not models:
+        shown = {"type": "object", "properties": {kind.kind: schema}, "required": [kind.kind]}
+        yield from ("", reference("", shown).partition("\n\n")[2])
+
+
+def _paragraphs(text: str) -> str:
+    return "\n\n".join(" ".join(each.split()) for each in text.split("\n\n"))
+
+
+def events() -> str:
+    """The table of events, without the head of its page."""
+    text = troubleshooting()
+    return text[text.index("| event |") :]
+
+
+def stand_commands() -> str:
+    """The commands of `stand`."""
+    return "\n".join(_commands(get_command(stand), "stand"))
+
+
+def compensate_commands() -> str:
+    """The commands of `compensate`."""
+    return "\n".join(_commands(get_command(compensate), "compensate"))
+
+
+def _commands(command: Any, name: str) -> Iterator[str]:
+    """A section for each command, those in groups included. The options that all commands have are left out."""
+    context = command.context_class(command, info_name=name)
+    if hasattr(command, "list_commands"):
+        for child in command.list_commands(context):
+            yield from _commands(command.resolve_command(context, [child])[1], f"{name} {child}")
+        return
+    yield from (f"## {name}", "", _help(command.help or ""), "")
+    own = [each for each in command.params if not each.name.startswith(("common_", "help"))]
+    if own:
+        rows = [_parameter(each, context) for each in own]
+        yield from ("| argument or option | what | default |", "|---|---|---|", *rows, "")
+
+
+def _help(text: str) -> str:
+    """Its paragraphs; the last line, `Example: ...`, as code."""
+    said, _, example = text.replace("\b", "").partition("Example: ")
+    return _paragraphs(said) + (f"\n\n```console\n{example.strip()}\n```" if example else "")
+
+
+def _parameter(each: Any, context: Any) -> str:
+    is_argument = each.param_type_name == "argument"
+    names = [each.make_metavar(context)] if is_argument else [*each.opts, *each.secondary_opts]
+    shown = ", ".join(f"`{name}`" for name in names)
+    is_default = isinstance(each.default, str | int | float) and not isinstance(each.default, bool)
+    return f"| {shown} | {_cell(each.help or '')} | {f'`{each.default}`' if is_default else ''} |"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+
+
+def routes() -> str:
+    """Each route of the HTTP interface, from its OpenAPI document."""
+    document = json.loads(OPENAPI.read_text(encoding="utf-8"))
+    lines = ["| method | path | what it does | takes |", "|---|---|---|---|"]
+    for path, methods in document["paths"].items():
+        for method, route in methods.items():
+            said = route.get("summary", "") if "description" not in route else route["description"]
+            first = said.strip().split("\n\n")[0]
+            body = route.get("requestBody", {}).get("content", {}).get("application/json", {}).get("schema", {})
+            taken = [f"`{each['name']}`" for each in route.get("parameters", []) if each["in"] == "query"]
+            taken += [f"`{name}`" for name in _fields(body, document)]
+            lines.append(f"| {method.upper()} | `{path}` | {_cell(first)} | {', '.join(taken)} |")
+    return "\n".join(lines)
+
+
+def _fields(schema: Any, document: Any) -> list[str]:
+    if "$ref" in schema:
+        schema = document["components"]["schemas"][schema["$ref"].rpartition("/")[2]]
+    return list(schema.get("properties", {}))
+
+
+def model_files() -> str:
+    """The keys of a model file in both forms, and then those of its parts."""
+    models: dict[str, Any] = {}
+    for file in (PaperFile, ThermalFile):
+        models |= file.model_json_schema()["$defs"]
+    first = ("PaperFile", "ThermalFile")
+    order = [*first, *sorted(name for name in models if name not in first)]
+    shown = {"properties": {}, "$defs": {name: models[name] for name in order}}
+    page = reference("", shown)
+    return page[page.index("## ") :]
+
+
+MADE: dict[str, Callable[[], str]] = {
+    "steps": steps,
+    "events": events,
+    "stand_commands": stand_commands,
+    "compensate_commands": compensate_commands,
+    "routes": routes,
+    "model_files": model_files,
+}

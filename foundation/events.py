@@ -302,13 +302,13 @@ REGULATOR_OCCUPIED = event("regulator_occupied", "warning", "{said}; the run wai
 AUTOTUNED = event("autotuned", "info", "{device} is tuned at {set_point_degC:g} degC; in the stand's file: {said}")
 NO_DEAD_MAN = event("no_dead_man", "warning",
     "no relay board guards the heat; when this computer dies, what ends it is {ends_it}",
-    "see that a hard-wired cut-out is in the heater's line: docs/safety.md")
+    "see that a hard-wired cut-out is in the heater's line: docs/explanation/safety.md")
 DEAD_MAN_LATE = event("dead_man_late", "warning",
     "{device}: this computer was held up while the relay's timer was tested; that test does not count",
     "it is tested again by itself; see what loads this computer when that is so at each start")
 DEAD_MAN_TESTED = event("dead_man_tested",
     lambda data: "info" if data.get("rearmed") and data.get("dropped") else "error", "{device}: {said}",
-    "take a board whose timed-on each command restarts (docs/drivers.md); `stand check --moves`",
+    "take a board whose timed-on each command restarts (docs/reference/devices.md); `stand check --moves`",
     cases=({"rearmed": True, "dropped": True}, {"dropped": False}))
 TO_AMBIENT = event("to_ambient", "info", "the plan is done; back to {ambient_degC:.1f} degC: {said}")
 AT_AMBIENT = event("at_ambient", "info", "the chamber is at the laboratory's temperature")

@@ -107,5 +107,5 @@ def _file(config: str) -> Path:
 
     stand = load_config(packaged("", config))
     if stand.interface.secrets is None:
-        raise ConfigError(f"{config}: has no interface.secrets; name a file for the tokens there (docs/api.md)")
+        raise ConfigError(f"{config}: has no interface.secrets; name a file for the tokens there (docs/reference/http-api.md)")
     return stand.interface.secrets

@@ -1,6 +1,6 @@
 """Our own regulator beside the E5CC: the same chamber, the same steps, over the wires; then ten drawn chambers.
 
-`python -m tests.bench.regulators` prints docs/drivers.md's table, with `drawn` that of the drawn chambers.
+`python -m tests.bench.regulators` prints docs/reference/devices.md's table, with `drawn` that of the drawn chambers.
 """
 
 from __future__ import annotations

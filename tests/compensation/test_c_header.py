@@ -173,7 +173,7 @@ def test_two_cameras_fit_into_one_program_in_c_and_in_c_plus_plus(tmp_path: Path
 
 
 def test_the_documentation_s_example_compiles_and_prints_what_python_says(tmp_path: Path):
-    text = (Path(__file__).parents[2] / "docs" / "in-c.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "how-to" / "apply-in-c.md").read_text(encoding="utf-8")
     (example,) = re.findall("```c\n(.*?)```", text, re.DOTALL)
     (tmp_path / "example.c").write_text(example)
     export_c(thermal(), tmp_path / "drift.h")

@@ -1,4 +1,4 @@
-"""The public names: what docs/notebook.md shows runs, `import thermostand` is enough, and arrays can be fitted."""
+"""The public names: what docs/how-to/use-from-python.md shows runs, `import thermostand` is enough, and arrays can be fitted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .conftest import Recorded
 from .test_calibration_session import record as record_calibration
 
 ROOT = Path(__file__).parents[2]
-NOTEBOOK = (ROOT / "docs" / "notebook.md").read_text(encoding="utf-8")
+NOTEBOOK = (ROOT / "docs" / "how-to" / "use-from-python.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", NOTEBOOK, re.DOTALL)
 
 
@@ -40,7 +40,7 @@ def test_what_the_notebook_page_shows_runs(recorded: Recorded, tmp_path: Path, m
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for block in BLOCKS:
-        exec(compile(block, "docs/notebook.md", "exec"), names)
+        exec(compile(block, "docs/how-to/use-from-python.md", "exec"), names)
     assert {"model.json", "report.html", "report.json"} <= set(os.listdir(tmp_path))
     assert len(names["settled"]) == 4  # type: ignore[arg-type]
     assert max(names["evaluation"].rms_after_px) < 0.012  # type: ignore[attr-defined]

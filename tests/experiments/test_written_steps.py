@@ -191,9 +191,9 @@ def test_the_schema_knows_what_may_be_written_in_short():
 
 
 def test_the_example_of_the_docs_can_be_planned():
-    lines = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text().splitlines()
+    lines = (Path(__file__).parents[2] / "docs" / "how-to" / "write-a-recipe.md").read_text().splitlines()
     example = "\n".join(line.removeprefix("    ") for line in lines if line.startswith("    "))
-    assert list(parse_document(example, Recipe, "docs/recipes.md").plan())
+    assert list(parse_document(example, Recipe, "docs/how-to/write-a-recipe.md").plan())
 
 
 NAMES = st.sampled_from([*StepEntry.model_fields, "steps", "times", "to_degC", "rate_K_per_min", "frames", "role", "x"])

@@ -1,8 +1,8 @@
 """The hazards of a stand: what must not happen, how it is found, and what limits it when the computer is dead.
 
-`docs/hazards.md` is made of it, with the times that `test_hazards.py` measures by night (hazards_measured.json):
+`docs/reference/hazards.md` is made of it, with the times that `test_hazards.py` measures by night (hazards_measured.json):
 
-    python -m tests.system.hazards > docs/hazards.md
+    python -m tests.system.hazards > docs/reference/hazards.md
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ HAZARDS = (
 
 
 def document() -> str:
-    """docs/hazards.md."""
+    """docs/reference/hazards.md."""
     return "\n".join(_lines()) + "\n"
 
 

@@ -21,7 +21,7 @@ TIMES_S = {
     "BUS": 1.0,  # three tries of 0.3 s (drivers/wires/modbus_client.py, bus.py)
 }
 BOUND_S = 33
-"""Of heat after the last look of a guard (docs/safety.md)."""
+"""Of heat after the last look of a guard (docs/explanation/safety.md)."""
 
 
 def broken(folder: Path, *changes: str) -> bool:

@@ -67,7 +67,7 @@ def test_each_test_that_is_named_exists():
 
 
 def test_the_document_is_made_of_the_table():
-    assert (TESTS.parent / "docs" / "hazards.md").read_text() == document()
+    assert (TESTS.parent / "docs" / "reference" / "hazards.md").read_text() == document()
 
 
 async def measured_s(bench: Bench, trial: Trial, phase_s: float) -> list[float]:
