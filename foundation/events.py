@@ -308,7 +308,7 @@ DEAD_MAN_LATE = event("dead_man_late", "warning",
     "it is tested again by itself; see what loads this computer when that is so at each start")
 DEAD_MAN_TESTED = event("dead_man_tested",
     lambda data: "info" if data.get("rearmed") and data.get("dropped") else "error", "{device}: {said}",
-    "take a board whose timed-on each command restarts (docs/reference/devices.md); `stand check --moves`",
+    "take a board whose timed-on each command restarts (docs/how-to/connect-your-stand.md); `stand check --moves`",
     cases=({"rearmed": True, "dropped": True}, {"dropped": False}))
 TO_AMBIENT = event("to_ambient", "info", "the plan is done; back to {ambient_degC:.1f} degC: {said}")
 AT_AMBIENT = event("at_ambient", "info", "the chamber is at the laboratory's temperature")

@@ -35,7 +35,9 @@ def try_them(config: ConfigOption = "simulated") -> None:
 
     stand = load_config(packaged("", config))
     if stand.alerts.secrets is None:
-        raise ConfigError(f"{config}: has no alerts.secrets; name a file with `urls:` there (docs/explanation/safety.md)")
+        raise ConfigError(
+            f"{config}: has no alerts.secrets; name a file with `urls:` there (docs/how-to/get-alerts.md)"
+        )
     check_alerts(stand.alerts)
     found = load_secrets(stand.alerts.secrets)
     text = "This is a test: alerts of this stand arrive here."

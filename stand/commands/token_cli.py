@@ -107,5 +107,7 @@ def _file(config: str) -> Path:
 
     stand = load_config(packaged("", config))
     if stand.interface.secrets is None:
-        raise ConfigError(f"{config}: has no interface.secrets; name a file for the tokens there (docs/reference/http-api.md)")
+        raise ConfigError(
+            f"{config}: has no interface.secrets; name a file for the tokens there (docs/how-to/open-to-the-network.md)"
+        )
     return stand.interface.secrets

@@ -1,4 +1,4 @@
-"""The public names: what docs/how-to/use-from-python.md shows runs, `import thermostand` is enough, and arrays can be fitted."""
+"""The public names: what use-from-python.md shows runs, `import thermostand` is enough, and arrays can be fitted."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The hazards of a stand: what must not happen, how it is found, and what limits it when the computer is dead.
 
-`docs/reference/hazards.md` is made of it, with the times that `test_hazards.py` measures by night (hazards_measured.json):
+docs/reference/hazards.md is made of it, with times that `test_hazards.py` measures by night (hazards_measured.json):
 
     python -m tests.system.hazards > docs/reference/hazards.md
 """

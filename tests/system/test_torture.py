@@ -1,4 +1,4 @@
-"""Drawn stands, plans, faults and orders that are known to be interesting break no invariant: docs/how-to/use-the-torture-rig.md."""
+"""Drawn stands, plans, faults and orders that are known to be interesting break no invariant: docs/how-to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m tests.torture [SEED | --seeds A..B | --minutes N | --case FILE] [--jobs N]`: docs/how-to/use-the-torture-rig.md."""
+"""`python -m tests.torture [SEED | --seeds A..B | --minutes N | --case FILE] [--jobs N]`: see docs/how-to."""
 
 from __future__ import annotations
 
