@@ -114,7 +114,8 @@ def _imported(module: str, name: str) -> Any:
     times).
     """
     # A calibration of 34 positions takes 5.9 to 6.9 s with two threads and 3.4 to 4.1 with one on two idle cores,
-    # with two busy programs running 17 to 22 and 3.2 to 3.7. Set before NumPy is imported; a program's own setting stays.
+    # with two busy programs running 17 to 22 and 3.2 to 3.7. Set before NumPy is imported; a program's own setting
+    # stays.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         group = get_group(importlib.import_module(module).app)
