@@ -163,7 +163,7 @@ def words(fault: ErrorDetails, written: str | None = None) -> str:
     said = fault["msg"].removeprefix("Value error, ")
     text = re.sub(r"^(Input|String|Value|Tuple|List|Dictionary) should ", "must ", said)
     if kind == "literal_error" and isinstance(fault["input"], str):
-        text += _nearest(fault["input"], re.findall(r"'([^']*)'", text))
+        text += nearest(fault["input"], re.findall(r"'([^']*)'", text))
     return text
 
 
@@ -247,12 +247,13 @@ def _number(place: Place, value: object, *, whole: bool) -> str:
 def _about_key(place: tuple[int | str, ...], model: type[BaseModel], listed: set[tuple[int | str, ...]]) -> str:
     """The key that may be meant, or those there are at this place unless they were listed before."""
     known = sorted({name for each in _models_at(model, place[:-1]) for name in each.model_fields})
-    if near := _nearest(str(place[-1]), known):
+    if near := nearest(str(place[-1]), known):
         return near
     return f"; known here: {', '.join(known)}" if known and place[:-1] not in listed else ""
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`; did you mean NAME?` of the known name that is most like it, "" when none is."""
     near = difflib.get_close_matches(name, list(known), 1, 0.6)
     return f"; did you mean {near[0]}?" if near else ""
 

@@ -15,6 +15,7 @@ from thermostand.drivers.settings import EquilibriumSettings, OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.registers import RegisterMap, load_register_map
 from thermostand.foundation.clock import Clock, VirtualClock
+from thermostand.foundation.document_faults import nearest
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.recording.format.batches import RecordedDevice
@@ -119,10 +120,12 @@ def _obeyed(regulator: Controller) -> tuple[Watch, ...]:
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     """Make every device the configuration names; nothing is opened. ConfigError when a named file, or the program of
-    guard.notify, is missing: a plan of the same configuration can be made elsewhere."""
+    guard.notify, is missing, or guard.channels does not fit the devices: a plan of the same configuration can be made
+    elsewhere."""
     notifier = Notifier(config.guard.notify, config.guard.notify_limit_s, clock)
     if missing := notifier.missing():
         raise ConfigError(missing)
+    _check_limited(config)
     bus, equipment = Bus("bus", config.bus, clock), config.equipment
     devices = make_devices(config, bus, hub, clock)
     state_file = config.compressor.state_file
@@ -152,6 +155,22 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         notifier=notifier,
         channels=check,
     )
+
+
+def _check_limited(config: StandConfig) -> None:
+    """ConfigError when guard.channels has what no device measures, or is read too seldom for its limit."""
+    known = [f"{name}.{each.name}" for name, device in recorded_devices(config).items() for each in device.channels]
+    polls_s = {each.name: each.poll_s or 0.0 for each in config.equipment}
+    for channel, limits in config.guard.channels.items():
+        if channel not in known:
+            raise ConfigError(
+                f"guard.channels: no device of the stand measures {channel}{nearest(channel, known)}; there are "
+                f"{', '.join(known)}"
+            )
+        if limits.after_s < 2 * (poll_s := polls_s[channel.partition(".")[0]]):
+            raise ConfigError(
+                f"guard.channels.{channel}.after_s must be at least twice the poll_s of its device ({poll_s:g} s)"
+            )
 
 
 def make_devices(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> Devices:

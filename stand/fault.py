@@ -33,6 +33,8 @@ class Readings(Protocol):
 
 # abort: make safe and end the run. hold: make safe and wait for an operator. warn: say so.
 Action = Literal["abort", "hold", "warn"]
+DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
+"""What a stand's file calls them."""
 
 
 @dataclass(frozen=True, slots=True)

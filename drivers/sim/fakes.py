@@ -17,6 +17,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 import thermostand.drivers.sim
+from thermostand.foundation.plugins import load_point
 
 if TYPE_CHECKING:
     from thermostand.drivers.sim.laboratory import Laboratory as Bench
@@ -59,16 +60,13 @@ def _load() -> None:
 
 
 def fake_of(key: str) -> Fake:
-    """The fake of a section, of one of its protocols, or of another package's kind; ValueError when there is none, or
-    it cannot be loaded."""
+    """The fake of a section, of one of its protocols, or of another package's kind; ValueError when there is none,
+    ConfigError when it cannot be loaded."""
     _load()
     if key in FAKES:
         return FAKES[key]
     for point in entry_points(group=GROUP, name=key):
-        try:
-            return Fake(point.load(), ADDED)
-        except Exception as error:  # importing a stranger's module may raise anything
-            raise ValueError(f"the fake of {key} cannot be loaded ({error})") from error
+        return Fake(load_point(point), ADDED)
     raise ValueError(f"there is no fake of a device of kind {key}")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, SerializeAsAny, field_validator, model_validator
 
@@ -55,6 +55,25 @@ class SensorsConfig(Document):
         return self
 
 
+class ChannelLimits(Document):
+    """What a channel has to stay within, in its own unit. Outside for after_s, or after so long without a reading,
+    action follows: trip ends the run, hold waits for an operator, warn says so; without a reading trip is a hold.
+    """
+
+    lowest: float | None = None
+    highest: float | None = None
+    after_s: float = Field(default=60.0, ge=1, le=86400)
+    action: Literal["trip", "hold", "warn"] = "warn"
+
+    @model_validator(mode="after")
+    def _limited(self) -> Self:
+        if self.lowest is None and self.highest is None:
+            raise ValueError("needs lowest, highest or both")
+        if self.lowest is not None and self.highest is not None and self.lowest >= self.highest:
+            raise ValueError(f"lowest {self.lowest:g} is not below highest {self.highest:g}")
+        return self
+
+
 class GuardConfig(Document):
     """When the guard makes the stand safe. The upper bounds are what the chamber survives: no file may lift them.
 
@@ -64,6 +83,7 @@ class GuardConfig(Document):
     pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
     hours. notify: a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may
     take. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
+    channels: limits for what any device measures, by its channel, as `lab.pressure`.
     added: settings of rules that other packages add, by their names. safe_limit_s: how long, at the end of a run, it is
     tried to have every actuator confirm that it is safe.
     heat_max_Wh_per_h: within any hour; good nights took up to 900.
@@ -98,6 +118,7 @@ class GuardConfig(Document):
     notify_limit_s: float = Field(default=10.0, gt=0, le=60)
     accept: tuple[str, ...] = ()
     pause_limit_h: float = Field(default=12.0, gt=0, le=24)
+    channels: dict[str, ChannelLimits] = Field(default_factory=dict[str, ChannelLimits])
     added: dict[str, SerializeAsAny[Document]] = Field(default_factory=dict)
     safe_limit_s: float = Field(default=600.0, ge=1, le=3600)
 

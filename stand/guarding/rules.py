@@ -13,8 +13,9 @@ from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.stand.config.added_rules import added_rule
 from thermostand.stand.config.dew import dew_point_degC
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.fault import Action, Readings, Rule, Watch, value_of
+from thermostand.stand.fault import DONE, Readings, Rule, Watch, value_of
 from thermostand.stand.gate import HELD, OPERATOR, RELEASED
+from thermostand.stand.guarding.channel_limits import limit_watches
 from thermostand.stand.guarding.channels import LEAST_LAG_S, Nature
 from thermostand.stand.guarding.drifting import drifting
 from thermostand.stand.guarding.heat_balance import heat_not_felt, too_much_heat
@@ -64,7 +65,6 @@ _PV_K = 0.1  # that a regulator shows
 _OUTSIDE_K = 40.0  # beyond the set-points no regulator's probe can be
 _CAMERA_DEGC = (-40.0, 120.0)  # as its driver takes them
 _CATCH_UP_S = 10.0  # that a disk needs for what was published while the process was stopped
-_DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
 
 
 class Announcements:
@@ -121,6 +121,7 @@ def watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
         *_operations(config, announced),
         *_contacts(config),
         *_dew(config),
+        *limit_watches(config.guard.channels),
         *(watch for name, each in config.guard.added.items() for watch in added_rule(name).watches(each, config)),
     )
 
@@ -335,7 +336,7 @@ def _contacts(config: StandConfig) -> tuple[Watch, ...]:
         channel = f"inputs.{name}"
         text = f"{channel} is {each.fault_when}{f': {each.means}' if each.means else ''}"
         watches.append(
-            Watch(contact(channel, float(each.fault_when == "closed"), text), each.after_s, _DONE[each.action])
+            Watch(contact(channel, float(each.fault_when == "closed"), text), each.after_s, DONE[each.action])
         )
         stale = "warn" if each.action == "warn" else "hold"
         limit_s = config.guard.stale_after_s

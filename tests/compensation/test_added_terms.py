@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.installed import install
 from thermostand.compensation.apply.runtime_export import export, export_c
 from thermostand.compensation.design.next_visit import Wanted, after, at_rest, decide, now, surroundings
 from thermostand.compensation.drift.model_file import load_model, save_model
@@ -45,7 +46,6 @@ class Gradient(Term):
     def usual(cls):
         return (cls(tau_s=700.0), cls(tau_s=2000.0))
 '''
-INFO = "Metadata-Version: 2.1\nName: acme-tube\nVersion: 1.0\n"
 VISITS = [Stretch(degC, 1500, "fit", 5) for degC in (52.0, 10.0, 45.0, 17.0, 31.0)]
 
 
@@ -53,11 +53,9 @@ VISITS = [Stretch(degC, 1500, "fit", 5) for degC in (52.0, 10.0, 45.0, 17.0, 31.
 def tube(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """The package, installed; nothing of this program knows it."""
     folder = tmp_path_factory.mktemp("site")
-    (folder / "acme_tube.py").write_text(MODULE)
-    info = folder / "acme_tube-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(INFO)
-    (info / "entry_points.txt").write_text("[thermostand.drift_terms]\ntube gradient = acme_tube:Gradient\n")
+    install(
+        folder, "acme-tube", {"acme_tube": MODULE}, {"thermostand.drift_terms": "tube gradient = acme_tube:Gradient"}
+    )
     sys.path.insert(0, str(folder))
     yield
     sys.path.remove(str(folder))
@@ -132,10 +130,7 @@ def test_the_forecast_has_it(seen: Night, model: ThermalModel):
 
 def test_a_package_that_is_broken_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen: Night):
     monkeypatch.syspath_prepend(tmp_path)
-    info = tmp_path / "acme_none-2.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(INFO.replace("acme-tube\nVersion: 1.0", "acme-none\nVersion: 2.0"))
-    (info / "entry_points.txt").write_text("[thermostand.drift_terms]\nnone = acme_none:No\n")
+    install(tmp_path, "acme-none", {}, {"thermostand.drift_terms": "none = acme_none:No"}, "2.0")
     with pytest.raises(ConfigError, match=r"none: acme-none 2.0 cannot be loaded.*reinstall it"):
         fit_thermal(seen.observed)
 

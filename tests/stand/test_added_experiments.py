@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import installed as written
 from thermostand.experiments.steps import Capture, SetTemperature
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
@@ -23,11 +24,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
     monkeypatch.syspath_prepend(tmp_path)
 
     def write(name: str, module: str, points: str) -> None:
-        (tmp_path / f"{name.replace('-', '_')}.py").write_text(module)
-        info = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[thermostand.experiments]\n{points}\n")
+        written.install(tmp_path, name, {name.replace("-", "_"): module}, {"thermostand.experiments": points})
 
     return write
 

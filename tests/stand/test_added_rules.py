@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.installed import install
 from thermostand.foundation.clock import VirtualClock, seconds_ns
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
@@ -45,12 +46,8 @@ RULE = GuardRule("room_hot", "the laboratory is too warm", Settings, watches, "o
 def room_hot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The package, installed; nothing of this program knows it."""
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "acme_room.py").write_text(MODULE)
-    info = tmp_path / "acme_room-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-room\nVersion: 1.0\n")
-    points = "room_hot = acme_room:RULE\nroom_cold = acme_none:RULE\nroom_wet = acme_room:RULE\n"
-    (info / "entry_points.txt").write_text(f"[thermostand.guard_rules]\n{points}")
+    points = "room_hot = acme_room:RULE\nroom_cold = acme_none:RULE\nroom_wet = acme_room:RULE"
+    install(tmp_path, "acme-room", {"acme_room": MODULE}, {"thermostand.guard_rules": points})
     yield
     KINDS.pop(f"{GUARD}room_hot", None)
     sys.modules.pop("acme_room", None)

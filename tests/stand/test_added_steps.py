@@ -9,6 +9,7 @@ from typing import Any, cast
 import pytest
 import yaml
 
+from tests.installed import install
 from tests.stand.small_stand import Life
 from thermostand.experiments.steps import (
     STEPS,
@@ -66,11 +67,8 @@ START_NS = 1_767_290_400 * NS_PER_S
 def lamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The package, installed; nothing of this program knows it."""
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "acme_lamp.py").write_text(MODULE)
-    info = tmp_path / "acme_lamp-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-lamp\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[thermostand.steps]\nlamp_on = acme_lamp:LampOn\nno_lamp = acme_none:No\n")
+    points = {"thermostand.steps": "lamp_on = acme_lamp:LampOn\nno_lamp = acme_none:No"}
+    install(tmp_path, "acme-lamp", {"acme_lamp": MODULE}, points)
     yield
     STEPS.pop("lamp_on", None)
     sys.modules.pop("acme_lamp", None)

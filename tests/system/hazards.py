@@ -215,6 +215,15 @@ HAZARDS = (
         ("system/test_paused.test_a_pause_that_lasts_too_long_is_made_safe_and_held",),
     ),
     Hazard(
+        "work goes on although what a device of the laboratory's own measures is outside its limits",
+        "as the laboratory has it: pressure, humidity, flow of the coolant",
+        "lost session",
+        (),
+        ("channel_limit", "channel_silent"),
+        _NOTHING_HEATS,
+        ("system/test_added_channel.test_a_limit_is_set_on_it",),
+    ),
+    Hazard(
         "heat although a contact of the stand says no",
         "as the contact's maker says: door, water, cut-out",
         "damage",

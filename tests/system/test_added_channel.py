@@ -1,7 +1,5 @@
 """A channel that another package's device declares is found everywhere by its own name and unit."""
 
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,14 +9,19 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.addresses import free_port
+from tests.installed import install, see_it_everywhere
 from tests.recording.test_export import csv_rows
+from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
-from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.errors import ConfigError, NotCleared, StandTripped
+from thermostand.foundation.hub import Hub
+from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Channel
 from thermostand.recording.exporting.export import export
 from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.reading.session import Session
-from thermostand.stand import simulator
+from thermostand.stand.assembly import assemble
 from thermostand.stand.assembly import recorded_devices as declared_devices
 from thermostand.stand.config.stand_config import StandConfig, packaged
 from thermostand.stand.running.order import Order
@@ -44,6 +47,7 @@ CHANNELS = (
     Channel("dew", "degC", "temperature"),
     Channel("ratio", ""),
     Channel("flow", "l/min", "flow"),
+    Channel("rain", "mm/h", "rain"),
 )
 
 
@@ -95,42 +99,39 @@ FAKE = """
 from thermostand.drivers.sim.wire import LineEngine
 
 
-class FakeStation:
+class Station:
     def __init__(self, bench, name, settings):
         self.asked = 0
         bench.listen(name, settings["address"], lambda: LineEngine(self.answer))
 
     def answer(self, line):
         self.asked += 1
-        return b"1013.2 11.5 0.25 " + (b"-" if self.asked % 5 == 0 else b"3.4")
+        return b"1013.2 11.5 0.25 " + (b"-" if self.asked % 5 == 0 else b"3.4") + b" -"
 """
 RECIPE = """
 name: short
 experiments:
   - steps: [{start_chamber: 24}, {soak: 120}]
 """
-LAB = {"kind": "station", "address": "tcp:127.0.0.1:15098"}
+
+
+def lab() -> dict[str, object]:
+    """In a stand's file."""
+    return {"kind": "station", "address": f"tcp:127.0.0.1:{free_port()}"}
+
+
 VALUES = {"pressure": 1013.2, "dew": 11.5, "ratio": 0.25, "flow": 3.4}
-UNITS = {"lab.pressure": "hPa", "lab.dew": "degC", "lab.ratio": "", "lab.flow": "l/min"}
+UNITS = {"lab.pressure": "hPa", "lab.dew": "degC", "lab.ratio": "", "lab.flow": "l/min", "lab.rain": "mm/h"}
 
 
 @pytest.fixture
 def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
     """The package, installed, for this process and those that it starts. Called, it changes the package's text."""
     folder = tmp_path / "site"
-    info = folder / "acme_station-1.0.dist-info"
-    info.mkdir(parents=True)
-    (folder / "acme_station.py").write_text(MODULE)
-    (folder / "acme_station_fake.py").write_text(FAKE)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-station\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        "[thermostand.devices]\nstation = acme_station:KIND\n"
-        "[thermostand.fakes]\nstation = acme_station_fake:FakeStation\n"
-    )
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
+    points = {"thermostand.devices": "station = acme_station:KIND", "thermostand.fakes": "station = acme_fake:Station"}
+    install(folder, "acme-station", {"acme_station": MODULE, "acme_fake": FAKE}, points)
+    see_it_everywhere(folder, monkeypatch)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    monkeypatch.setattr(simulator, "subprocess", subprocess)  # a program of its own, which sees what is installed
 
     def changed(was: str, now: str) -> None:
         (folder / "acme_station.py").write_text(MODULE.replace(was, now))
@@ -142,7 +143,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 def stand_with(**changes: Any) -> StandConfig:
     data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
-    data["devices"] = {"lab": LAB}
+    data["devices"] = {"lab": lab()}
     data["guard"] = {**data.get("guard", {}), **changes}
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
@@ -150,7 +151,7 @@ def stand_with(**changes: Any) -> StandConfig:
 @pytest.mark.usefixtures("station")
 async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_path: Path, order: Callable[..., Order]):
     session = Session.open(
-        await run_virtual(order(RECIPE, devices={"lab": LAB}), tmp_path / "out", None, lambda _: None)
+        await run_virtual(order(RECIPE, devices={"lab": lab()}), tmp_path / "out", None, lambda _: None)
     )
     declared = recorded_devices(session)["lab"]
     assert (declared.kind, declared.channels) == (
@@ -160,6 +161,7 @@ async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_pa
             Channel("dew", "degC", "temperature"),
             Channel("ratio", ""),
             Channel("flow", "l/min", "flow"),
+            Channel("rain", "mm/h", "rain"),
         ),
     )
     assert {channel: unit for channel, unit in session.units().items() if channel.startswith("lab.")} == UNITS
@@ -176,6 +178,7 @@ async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_pa
         "dew_degC",
         "ratio",
         "flow_l_per_min",
+        "rain_mm_per_h",
         "remarks",
     ]
     assert {(row["pressure_hPa"], row["ratio"], row["flow_l_per_min_quality"]) for row in rows} == {
@@ -185,6 +188,64 @@ async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_pa
     history = session_columns(session.path, 200)
     assert {channel: history.units[channel] for channel in UNITS} == UNITS
     assert {round(value, 1) for value in history.low["lab.pressure"].tolist() if value == value} == {1013.2}
+
+
+OUTSIDE = "guard.channel_limit"
+SILENT = "guard.channel_silent"
+
+
+@pytest.mark.usefixtures("station")
+@pytest.mark.parametrize(
+    ("channel", "limits", "kind", "shown", "action"),
+    [
+        ("lab.pressure", {"lowest": 900, "highest": 1100}, None, "", ""),
+        ("lab.flow", {"lowest": 3, "highest": 4}, None, "", ""),  # each fifth reading is missing
+        ("lab.pressure", {"highest": 1000}, OUTSIDE, "1013.2 hPa", "warn"),
+        ("lab.ratio", {"lowest": 0.5, "action": "trip"}, OUTSIDE, "0.25,", "abort"),
+        ("lab.rain", {"highest": 1}, SILENT, "no sensor", "warn"),
+        ("lab.rain", {"highest": 1, "action": "trip"}, SILENT, "no sensor", "hold"),
+    ],
+)
+async def test_a_limit_is_set_on_it(
+    tmp_path: Path,
+    order: Callable[..., Order],
+    channel: str,
+    limits: dict[str, Any],
+    kind: str | None,
+    shown: str,
+    action: str,
+):
+    seen: list[Event] = []
+
+    def watch(hub: Hub) -> None:
+        hub.subscribe(lambda item: seen.append(item) if isinstance(item, Event) else None)
+
+    guard = {"channels": {channel: {"after_s": 20, **limits}}}
+    run = run_virtual(order(RECIPE, devices={"lab": lab()}, guard=guard), tmp_path / "out", None, watch)
+    if action in ("abort", "hold"):
+        with pytest.raises(StandTripped if action == "abort" else NotCleared):
+            await run
+    else:
+        await run
+    found = [event for event in seen if event.kind in (OUTSIDE, SILENT)][:1]
+    assert [(event.kind, event.data["action"]) for event in found] == ([(kind, action)] if kind else [])
+    assert all(channel in event.text and shown in event.text for event in found)
+
+
+@pytest.mark.usefixtures("station")
+@pytest.mark.parametrize(
+    ("limited", "sentence"),
+    [
+        ({"lab.presure": {"highest": 1}}, r"no device .* measures lab.presure; did you mean lab.pressure\?"),
+        ({"lab.pressure": {"highest": 1, "after_s": 1}}, "lab.pressure.after_s must be at least twice the poll_s"),
+        ({"lab.pressure": {"lowest": 2, "highest": 1}}, "lowest 2 is not below highest 1"),
+        ({"lab.pressure": {}}, "needs lowest, highest or both"),
+        ({"lab.pressure": {"highest": 1, "action": "cry"}}, "guard.channels.lab.pressure.action"),
+    ],
+)
+def test_limits_that_do_not_fit_are_refused(limited: dict[str, Any], sentence: str):
+    with pytest.raises(ConfigError, match=sentence):
+        assemble(stand_with(channels=limited), Hub(), VirtualClock(0))
 
 
 @pytest.mark.parametrize(
@@ -208,6 +269,6 @@ def test_names_that_cannot_be_found_again_are_refused(station: Callable[[str, st
 @pytest.mark.usefixtures("station")
 def test_two_devices_of_one_name_are_refused():
     data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
-    data["devices"] = {"camera": LAB}
+    data["devices"] = {"camera": lab()}
     with pytest.raises(ConfigError, match="the name camera is that of two devices"):
         parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")

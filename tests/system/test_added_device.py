@@ -1,8 +1,6 @@
 """A kind of device that another package adds is found everywhere by its one row, and its fake by its name."""
 
 import asyncio
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,6 +9,8 @@ from typing import Any, cast
 import pytest
 import yaml
 
+from tests.addresses import free_port
+from tests.installed import install, see_it_everywhere
 from thermostand.drivers.devices.checking import Finding
 from thermostand.drivers.devices.kinds import built_in
 from thermostand.drivers.sim.fakes import FAKES, fake_of
@@ -19,7 +19,6 @@ from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.recording.reading.session import Session
-from thermostand.stand import simulator
 from thermostand.stand.assembly import assemble, device_kinds
 from thermostand.stand.commissioning.commissioning import commission
 from thermostand.stand.config.stand_config import StandConfig, packaged
@@ -117,18 +116,12 @@ class FakeLamp:
 def lamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The package, installed, for this process and those that it starts; nothing of this program knows it."""
     folder = tmp_path / "site"
-    info = folder / "acme_lamp-1.0.dist-info"
-    info.mkdir(parents=True)
-    (folder / "acme_lamp.py").write_text(MODULE)
-    (folder / "acme_fake.py").write_text(FAKE)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-lamp\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        "[thermostand.devices]\nlamp = acme_lamp:KIND\ndim = acme_lamp:KIND\nnone = acme_none:KIND\n"
-        "[thermostand.fakes]\nlamp = acme_fake:FakeLamp\n"
-    )
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setattr(simulator, "subprocess", subprocess)  # a program of its own, which sees what is installed
+    points = {
+        "thermostand.devices": "lamp = acme_lamp:KIND\ndim = acme_lamp:KIND\nnone = acme_none:KIND",
+        "thermostand.fakes": "lamp = acme_fake:FakeLamp\nburnt = acme_burnt:FakeLamp",
+    }
+    install(folder, "acme-lamp", {"acme_lamp": MODULE, "acme_fake": FAKE}, points)
+    see_it_everywhere(folder, monkeypatch)
     yield
     sys.modules.pop("acme_lamp", None)
 
@@ -151,6 +144,12 @@ def test_each_kind_of_device_has_its_fake_and_each_fake_its_kind():
     settings["regulator"] = ("regulator",)  # of the two kinds in that section, one has nothing to be simulated
     fake_of("relays")
     assert sorted(FAKES) == sorted(key for keys in settings.values() for key in keys)
+
+
+@pytest.mark.usefixtures("lamp")
+def test_a_fake_that_cannot_be_loaded_is_named_with_its_package():
+    with pytest.raises(ConfigError, match=r"burnt: acme-lamp 1.0 cannot be loaded .*; reinstall it"):
+        fake_of("burnt")
 
 
 @pytest.fixture
@@ -224,7 +223,7 @@ def test_it_obeys_by_hand_and_is_safe_afterwards(laboratory: StandConfig):
 
 @pytest.mark.usefixtures("lamp")
 async def test_a_run_records_what_it_reads(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(RECIPE, devices={"beam": {"kind": "lamp", "address": "tcp:127.0.0.1:15099"}})
+    ordered = order(RECIPE, devices={"beam": {"kind": "lamp", "address": f"tcp:127.0.0.1:{free_port()}"}})
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, lambda hub: None))
     times_ns, values, *_ = session.readings("beam.current")
     assert len(times_ns) > 10

@@ -16,6 +16,7 @@ from types import FrameType
 
 import pytest
 
+from tests.installed import install
 from tests.system.conftest import SHORT_RECIPE
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import telling
@@ -46,14 +47,11 @@ def break_now(order: Order, name: str, value: object) -> None:
 async def test_a_session_says_which_package_has_made_steps_of_its_plan(
     tmp_path: Path, order: Callable[..., Order], monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "acme.py").write_text(
+    module = (
         "from thermostand.experiments.steps import CloseFlap\nfrom pydantic import BaseModel\n"
         "class P(BaseModel): pass\ndef shut(p: P): yield CloseFlap()\n"
     )
-    info = tmp_path / "acme-1.2.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.2\n")
-    (info / "entry_points.txt").write_text("[thermostand.experiments]\nshut = acme:shut\n")
+    install(tmp_path, "acme", {"acme": module}, {"thermostand.experiments": "shut = acme:shut"}, "1.2")
     monkeypatch.syspath_prepend(tmp_path)
     ordered = order("name: shut\nexperiments: [shut: {}]\n")
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, ignore))
