@@ -82,7 +82,7 @@ def test_a_command_in_the_text_exists(command: str):
 
 
 def test_the_commands_in_the_pages_of_docs_exist_with_their_options():
-    pages = [page.read_text(encoding="utf-8") for page in ROOT.glob("docs/**/*.md") if "decisions" not in page.name]
+    pages = [page.read_text(encoding="utf-8") for page in ROOT.glob("docs/**/*.md")]
     inline = {found for page in pages for found in re.findall(r"`((?:stand|compensate) [a-z][^`]*)`", page)}
     blocks = {
         found for page in pages for found in re.findall(r"(?m)^ {4}(?:\.venv/bin/)?((?:stand|compensate) .*)", page)
