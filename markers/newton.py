@@ -135,6 +135,8 @@ def settle(setting: Setting, p: Float, scale: float, reach: Float, belief: Belie
         length, gained = math.hypot(step[CX], step[CY]), gain(work, step)
         far = length > _FAR_PX
         is_last = is_short(length, gained / variance, is_near)
+        # The last step takes J'WJ from the one before, scaled by the blurs' ratio; without the scaling centres are off
+        # by 2e-2 mpx.
         is_near = not is_near and length < _NEAR_PX and gained < _NEAR_GAIN * variance
         if is_near:
             sharpen(work, (p[SIGMA] - step[SIGMA]) / p[SIGMA])

@@ -61,6 +61,8 @@ def equations_of(slopes: Slopes, off: Float, pictures: int, markers: int) -> tup
     beside = np.concatenate([_rows(to_own @ of_pictures[0]), _rows(to_points @ of_markers[0])])
     crossed = np.swapaxes(np.swapaxes(own, 2, 3) @ points, 1, 2).reshape(-1, 3 * markers)
     others = [[_diagonal(to_own @ of_pictures[1]), crossed], [crossed.T, _diagonal(to_points @ of_markers[1])]]
+    # By picture and board point: written out, the derivative is 3,900 x 251 and nearly all zeros, and an adjustment
+    # takes 0.27 s instead of 0.11.
     normal = np.block([[flat.T @ flat, beside.T], [beside, np.block(others)]])
     parts = flat.T @ off.ravel(), (to_own @ of_pictures[2]).ravel(), (to_points @ of_markers[2]).ravel()
     return normal, np.concatenate(parts)

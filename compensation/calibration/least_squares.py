@@ -36,6 +36,8 @@ class Solution(Generic[State]):
     covariance: Float
 
 
+# SciPy's solvers step one vector and end by relative changes; here a step turns rotations in place, and ends by the
+# expected fall of the sum of squares.
 def minimise(
     start: State,
     residuals: Callable[[State], Float],

@@ -118,6 +118,8 @@ def _predicts_better(paper: Candidate, thermal: Candidate) -> bool:
     not weigh against its prediction: it is in the file in any case, and `apply` takes it where there is none."""
     squares = [[float(one.squares_between.mean())] for one in (paper, thermal)]
     if paper.moving_rms_px is not None and thermal.moving_rms_px is not None:
+        # At rest the paper's form was chosen for 2 of 24 drawn cameras by 0.1 mpx, where it left 33 and 74 mpx after
+        # switching on and the thermal form 2 and 3.
         for of_form, one in zip(squares, (paper.moving_rms_px, thermal.moving_rms_px), strict=True):
             of_form.append(one[0] ** 2 + one[1] ** 2)
     rms_px = [float(np.sqrt(np.mean(of_form))) for of_form in squares]

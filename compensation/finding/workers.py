@@ -38,6 +38,7 @@ def in_processes(workers: int) -> Work:
     another; SessionError when that does not help.
 
     The process that they are forked from loads what they need from now on, while this one makes the pieces."""
+    # Started afresh, each process would load numba, SciPy and OpenCV again: 1 s of processor time.
     multiprocessing.set_forkserver_preload([find_markers.__module__])
     ensure_running()
 

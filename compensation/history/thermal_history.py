@@ -240,6 +240,7 @@ def states_at(history: ThermalHistory, memory: ThermalMemory, time_ns: TimesNs, 
     return States(memory, _rows_at(history, memory, times_ns.tobytes(), degC.tobytes()))
 
 
+# A fit asks for the same states twice and its report up to four times more; following them is a third of a fit.
 @lru_cache(maxsize=8)
 def _rows_at(history: ThermalHistory, memory: ThermalMemory, times: bytes, temperatures: bytes) -> Float:
     time_ns, camera_degC = np.frombuffer(times, np.int64), np.frombuffer(temperatures, np.float64)
@@ -261,6 +262,8 @@ def _followed(memory: ThermalMemory, inputs: Float, after: NDArray[np.intp]) -> 
     state, wanted = state_of(memory), set(after.tolist())
     rows = {0: row_of(state)}
     for number, sample in enumerate(inputs.tolist(), 1):
+        # The run-time's own recursion: states of a whole session at once took 12 ms for 96, which a fit of 2.9 s does
+        # not show.
         state.advance(*sample)
         if number in wanted:
             rows[number] = row_of(state)

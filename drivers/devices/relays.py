@@ -179,6 +179,7 @@ class NoRelays:
     async def read(self) -> tuple[Reading, ...]:
         """heater_enable, compressor, camera_power; 1 on, 0 off."""
         now_ns = self._clock.now_ns()
+        # As a board would read, so that rules, keeper and runs have one path for a climate chamber, too.
         states = {HEATER_ENABLE: self._is_on(HEATER_ENABLE), COMPRESSOR: self._is_on(COMPRESSOR), CAMERA_POWER: True}
         return tuple(Reading(f"{self.name}.{channel}", float(on), "1", now_ns) for channel, on in states.items())
 

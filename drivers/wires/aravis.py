@@ -81,6 +81,7 @@ class GigeDevice:
     def _call(self, function: str, *arguments: object) -> Any:
         if not self._camera:
             raise ValueError("the device is closed")
+        # By name from the library's own mapping; only functions with a GError are wrapped.
         return self._library[function](self._camera, *arguments)
 
     def close(self) -> None:

@@ -35,6 +35,7 @@ DELETED = ".deleted"  # of a folder that is being deleted, behind a dot and its 
 _VERSION = 4  # of the index; the program's version counts, too, for what it says of a session
 _BUSY_S = 1.0  # how long another one that writes the index is waited for
 _SCHEMA = "CREATE TABLE sessions (name BLOB PRIMARY KEY, sealed TEXT NOT NULL, entry TEXT NOT NULL)"
+# Each file is asked for its size: one that was cut short in place must not be listed as sound.
 _File = tuple[str, int, int, bool]  # name, size, time of its last change in ns, whether a recorder has it open
 _INSTANT, _TEXT = (int, type(None)), (str,)
 _KINDS: dict[str, tuple[type, ...]] = {

@@ -123,6 +123,8 @@ class Chamber:
         found = {reading.channel: reading.value for reading in await self._regulator.read()}
         pv_degC, sp_degC = (found.get(f"{self._regulator.name}.{name}", math.nan) for name in ("pv", "sp"))
         begin_degC = next((each for each in (pv_degC, sp_degC) if not math.isnan(each)), setpoint_degC)
+        # Here, and neither in the plan, whose steps would then differ from stand to stand, nor in the regulator's own
+        # ramp, which not every make has.
         steps = max(1, math.ceil(abs(setpoint_degC - begin_degC) / _STEP_K))
         way_degC = (begin_degC + (setpoint_degC - begin_degC) * step / steps for step in range(1, steps))
         return [*(min(max(each, low), high) for each in way_degC), setpoint_degC]

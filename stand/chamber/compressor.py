@@ -58,6 +58,7 @@ def decide(
     starts_ns = tuple(start for start in state.starts_ns if start > hour_ago_ns)
     held_ns = now_ns - state.since_ns
     if state.running:
+        # It runs on while the heater trims: cycled for each demand, its 600 W swing the air by 0.4 to 1 K.
         unwanted = mv_heat > limits.stop_above_heat_percent and not mv_cool > 0
         if unwanted and held_ns >= seconds_ns(limits.min_on_s):
             return CompressorState(running=False, since_ns=now_ns, starts_ns=starts_ns)

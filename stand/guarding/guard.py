@@ -169,6 +169,8 @@ class Guard:
             self.latch.trip(fault)
         self._ended = not self.keeps_on
         try:
+            # The run's stop latches and leaves the demand for safety to the line below: a run that cannot be ended must
+            # not keep the guard from its own.
             self.stop(fault)  # first: nothing moves any more that making safe would have to overtake
         finally:
             self._make_safe(fault)

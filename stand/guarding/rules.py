@@ -159,6 +159,7 @@ def _heat(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
             )
         ),
         Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, _surroundings(config)), action="hold"),
+        # The unit and this program may differ for keys_s: somebody may press a key at its panel.
         Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
         Watch(trustworthy(PERMIT, limits.keys_s), limits.keys_s, "hold"),
     )

@@ -12,6 +12,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Item
 from thermostand.stand.imaging.cameras import Cameras
 
+# Round number; nothing was measured.
 LOST_LIMIT_S = 1800.0
 RETRY_S, LONGEST_RETRY_S = 1.0, 10.0
 

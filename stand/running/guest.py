@@ -72,6 +72,8 @@ _AGAIN_S = 60.0  # after a device that did not do what was commanded
 _FOLLOWS_K = 1.0  # the set-point follows the laboratory in such steps
 
 
+# The end of a run and no step of its plan, so that plans, ids and hashes stay; on by default, off on the simulated
+# stand.
 async def to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandConfig) -> None:
     """Until it is done, `ending.max_s` are over, or it is cancelled; a hold is waited for. Events: `to_ambient`, and
     `at_ambient` or `not_at_ambient` (a warning). Nothing happens on a stand that is there, or is not asked to."""

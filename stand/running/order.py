@@ -20,6 +20,7 @@ from thermostand.stand.config.stand_config import StandConfig, load_config, pack
 from thermostand.stand.estimating.durations import ConfiguredStand
 from thermostand.stand.estimating.estimate import check_step, price
 
+# A session has its register maps and simulated cameras with it, so that it can be resumed elsewhere.
 _REGISTERS, _OPTICS = "registers-{}.yaml", "optics-{}.yaml"  # their names in a session
 
 

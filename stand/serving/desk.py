@@ -209,7 +209,9 @@ class StandState(Value):
     reasons: tuple[str, ...] = ()
     fault: FaultState | None = None
     prompt: PromptState | None = None
+    # Data of its own, and no phase: programs wait for the phase `idle`, which heat by hand must not change.
     by_hand: HeatByHand | None = None
+    # Also what is merely under way, such as a flap that closes, so that "no failure yet" is not read as "safe".
     not_confirmed: tuple[NotConfirmed, ...] = ()
     readings: dict[str, ReadingState] = Field(default_factory=dict)
     setpoint_degC: float | None = None

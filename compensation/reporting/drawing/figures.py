@@ -359,6 +359,7 @@ def one_by_one(figures: Sequence[Named]) -> list[str]:
     return [as_svg(figure, name) for figure, name in figures]
 
 
+# Figures go through files: a pool whose process is killed while a long message is in its pipe waits for ever.
 @contextmanager
 def drawing(workers: int) -> Generator[Draw]:
     """With two or more workers one process more, which loads what it needs from now on."""

@@ -18,6 +18,7 @@ from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguag
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import Unreachable
 
+# No checksum protects a reply: one with another number of fields or digits than the one before it is refused.
 _FIELD = re.compile(r"-?\d{3,4}\.\d")
 _DIGITS = re.compile(r"[01]{26}|[01]{32}")
 

@@ -105,6 +105,8 @@ class HeatModule:
         next one has failed, or is overdue. DeviceError, and the output is at zero, when it gives heat though nothing
         does."""
         async with self._exclusive:
+            # While it heats only the law speaks to the module: a poll would refresh the watchdog of a law that has
+            # died.
             if self._armed_ns is not None and self._last:
                 return self._exchanged()
             await self._make_sure()
@@ -167,6 +169,7 @@ class HeatModule:
             await self._zero()
             self.uncontrolled = ""
             with suppress(DeviceError):
+                # On while nothing is given, it would trip in every idle hour.
                 await self._switch(_WATCHDOG, False)
             self._armed_ns = None
 
@@ -193,6 +196,7 @@ class HeatModule:
 
     async def _make_sure(self) -> None:
         """That it is the module that answered before, or it gets no heat; off is never withheld."""
+        # Also after each loss of the line: a module that was exchanged in mid-run must not be heated with.
         if not self._exclusive.is_known:
             await self._unit.probe()
             self._exclusive.is_known = True

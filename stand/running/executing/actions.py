@@ -36,6 +36,7 @@ from thermostand.stand.running.memory.state import Plan, RunState, SetUp
 CREDITED_WITHIN_K = 1.0
 # A capture that was interrupted for longer than this is taken again: its flap was shut meanwhile, and the air is not
 # the same any more.
+# Round number; nothing was measured.
 AGAIN_AFTER_S = 60.0
 # A disk that loses frames each time must not hold the night for good.
 AGAIN_FOR_LOST_FRAMES = 3

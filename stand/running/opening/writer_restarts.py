@@ -8,6 +8,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.interlocks import RECORDING_ENDED
 
+# Round number; nothing was measured.
 MOST_PER_H = 3
 """A kernel that is short of memory kills once or twice; what is killed more often has a cause that stays."""
 

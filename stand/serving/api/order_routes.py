@@ -62,6 +62,7 @@ def commands(bridge: Bridge) -> APIRouter:
             for each in bridge.commands.values()
         )
 
+    # Asked of the stand by the page: rules written again in JavaScript would differ from those that count.
     @router.post("/run/plan/check", response_model=PlanCheck)
     async def check_edit(body: PlanRequest) -> Response:
         """What replacing these steps would say, step by step; changes nothing."""
