@@ -34,7 +34,7 @@ COLD_K = 3.0
 """A camera this close to the air around it has been off for long: nothing of it is warm."""
 UNPOWERED_TAU_S = 900.0
 """An unpowered camera reports no temperature; its excess over the air is assumed to decay so until it does."""
-HULL_MARGIN_PX = 1.0
+HULL_MARGIN_PX = 1.0  # the markers themselves move by about so much
 COLDEST_degC, HOTTEST_degC = -273.15, 1000.0
 MOST_CORNERS = 2000
 """Of a hull: that of a night's markers has about 40. Each point is compared with each corner."""

@@ -26,7 +26,7 @@ from thermostand.experiments.steps import (
     usual_s,
 )
 
-MOST_VISITS = 200
+MOST_VISITS = 200  # round number; nothing was measured
 # A held-out visit after each third one. Round number; nothing was measured.
 _VALIDATED_AFTER = 3
 

@@ -22,7 +22,7 @@ from threading import Thread
 from thermostand.foundation.calls import Line, answer_all
 from thermostand.foundation.patience import Patience
 
-_END_WITHIN_S = 0.5
+_END_WITHIN_S = 0.5  # round number; nothing was measured
 _LOOK_S = 0.01
 
 

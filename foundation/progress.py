@@ -17,7 +17,7 @@ from thermostand.foundation.output import output
 
 # Plain output: a line each time this share of the work is done, so that a log stays readable.
 _PLAIN_STEP = 0.1
-_LATE_NS = 3 * NS_PER_S
+_LATE_NS = 3 * NS_PER_S  # work that is done sooner needs no bar; round number, nothing was measured
 
 
 class Report(Protocol):

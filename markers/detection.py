@@ -66,7 +66,7 @@ _DOUBTFUL_GROWTH, _SUSPECT_GROWTH = 1.4, 1.3
 _DOUBTFUL_TOGETHER, _SUSPECT_TOGETHER = 0.35, 0.3
 """Growth along x and y and of the levels' variance: each scatters by itself where there is only noise, and they grow
 together where residuals hang together: 0.05 +- 0.09 by noise alone (54 markers), 0.59 +- 0.12 by JPEG of quality 90."""
-_DOUBTFUL_CHANCES = 3.0
+_DOUBTFUL_CHANCES = 3.0  # standard deviations of what chance makes of the sum
 _DOUBTFUL_LEVELS = 1.3
 _BEYOND_CHANCE = 1.5
 """Of a mean square over a frame's markers, 54 of them: chance reaches it once in a hundred frames."""
@@ -200,10 +200,10 @@ def implied_edges(
 
 # Whether a target is still where the frame before had it, and which rows of the picture it takes to follow it.
 
-_FOLLOWED_PART = 0.9
-_GREATEST_STEP_PX = 5.0
-_GLANCE_BLURS = 3.0
-_GLANCE_CONTRAST = 0.75
+_FOLLOWED_PART = 0.9  # of the markers; round number, nothing was measured
+_GREATEST_STEP_PX = 5.0  # drift between two frames is below 0.05 px
+_GLANCE_BLURS = 3.0  # from the outline: beyond it the edge has its full level
+_GLANCE_CONTRAST = 0.75  # of the contrast before; round number, nothing was measured
 _TOWARDS = np.array([[function(k * np.pi / 8) for k in range(16)] for function in (np.cos, np.sin)])
 _TWICE = 2 * _TOWARDS[0] * _TOWARDS[1]
 _ROOM_PX, _ROOM_OF_UNSEEN = 4.0, 0.5

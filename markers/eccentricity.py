@@ -18,7 +18,7 @@ from thermostand.markers.grid import fit_homography, project
 from thermostand.markers.plane import to_image
 from thermostand.markers.target import Target
 
-_ROUNDS = 3
+_ROUNDS = 3  # a correction changes its own map by a small part of itself only
 _OUTLINE_POINTS = 96
 _OUTLINE_RADIUS = math.sqrt(3 / (2 + math.cos(2 * math.pi / _OUTLINE_POINTS)))
 """Of the polygon over the disc's: both then have the same second moment over area, which is what moves the centroid."""

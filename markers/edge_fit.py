@@ -34,7 +34,7 @@ from thermostand.markers.pixels import Picture, empty_pixels
 from thermostand.markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
 from thermostand.markers.sectors import misfits
 
-_SATURATED_PART = 0.1
+_SATURATED_PART = 0.1  # round number; nothing was measured
 
 
 class Flag(IntFlag):

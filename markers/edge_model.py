@@ -41,7 +41,7 @@ X, Y, VALUES, SHARES, RESIDUALS, RISES = range(PARAMETERS + 1, PARAMETERS + 7)
 other rows of `Pixels.table`."""
 ROWS = PARAMETERS + 7
 _TINY, _ZERO, _HALF, _ONE = np.float32(1e-12), np.float32(0), np.float32(0.5), np.float32(1)
-_TABLE_END = np.float32(6)
+_TABLE_END = np.float32(6)  # in blurs: beyond it the step is 0 or 1 to 1e-9
 # With a series of second order between the nodes 8 kB give what 128 kB gave with linear interpolation, and they stay in
 # the nearest cache.
 _CELLS = 1024

@@ -37,7 +37,7 @@ from thermostand.markers.target import DonutMarkers, OddMarker, Target
 # A missing marker counts as so much residual. In rendered clutter the choice by residual found 8 of 10 targets and none
 # wrong, that by the number of markers 4 of 10 and one wrong.
 _MISSING_PX = 0.5
-_FEWER_THAN_BEST = 2
+_FEWER_THAN_BEST = 2  # markers; from rendered scenes with clutter
 LEAST_SEEN = 6
 """Fewer markers are no placement: any four fit a homography."""
 _OWN_PLACE = (0.2, 0.06)
@@ -310,7 +310,7 @@ __all__ = [
 # Another placement within this factor of the best is a refusal, not a guess: of ten rendered scenes with clutter two
 # were refused and none was wrong.
 _AMBIGUOUS_RESIDUAL = 1.5
-_AMBIGUOUS_ROLL_DEG = 30.0
+_AMBIGUOUS_ROLL_DEG = 30.0  # turns that differ by less are refused; round number, nothing was measured
 _TRACKED_PITCH = 0.5
 _MOST_SPOTS, _MOST_SPOTS_PER_MARKER = 2000, 20
 """Among more spots that look like markers nothing is looked for: the time grows with their number."""

@@ -43,7 +43,7 @@ _SLOPES_FROM_PX = 6.0
 """Below this radius a plane and the edge cannot be separated: ground and disc are then constant."""
 # Sixty pixels for twelve parameters. Round number; nothing was measured.
 _PIXELS_PER_PARAMETER = 5
-_FAR_PX = 1.0
+_FAR_PX = 1.0  # round number; nothing was measured
 _NEAR_PX, _NEAR_GAIN = 0.02, 50.0
 """After a step not longer, and with no more gain in variances of a pixel, J'WJ is what it was, to 1 %: chance moves the
 parameters by as much from one frame to the next."""
@@ -55,11 +55,11 @@ _CONVERGED_PX = 2e-3
 # A longer step leaves the band in which the derivative holds.
 _GREATEST_STEP_PX = 3.0
 _GREATEST_BEND = 0.3
-_LEAST_SIGMA_PX = 0.1
+_LEAST_SIGMA_PX = 0.1  # less than the pixel's own blur of 0.29 px: no edge
 _LEAST_CONTRAST_SIGMA = 2.0
 # A bound only: two steps are enough for a followed marker, eight for a first one.
 _STEPS = 24
-_GATHERINGS = 12
+_GATHERINGS = 12  # a bound only
 
 SETTLED, TOO_FEW, DIVERGED = range(3)
 

@@ -45,7 +45,7 @@ from thermostand.markers.pixels import CORE, DISC, GROUND, Pixels
 # Chosen on discs of 17 px (of 3, 4, 6 and 8), judged on radii of 10, 17 and 35 px, other angles and seeds; noise alone
 # stays at 1.00 to 1.08. Two would fit the 15 photographs better (chi^2 of 1.0, not 2.5), but are worse known elsewhere.
 MOST_CLUSTERS = 6
-_LEAST_CLUSTERS = 2
+_LEAST_CLUSTERS = 2  # of a quadrant: one would have no variance
 # Twice as much makes four clusters of a disc of 17 px instead of six, half changes discs below 11 px only.
 _LEAST_ARC_px = 3.0
 """Residuals nearer than this hang together by the blur and by the colour filter alone."""

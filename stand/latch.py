@@ -33,7 +33,7 @@ UNREADABLE = "latch_unreadable"
 _KIND = "latch"
 _ENDS = (".latched.json", ".again.latched.json")  # each synced by itself: what is lost at once is one of them
 _READ_WITHIN_S = 5.0  # before anything is opened: a disk that has slept needs some seconds, nobody waits for them
-_LONGEST_BYTES = 1_000_000
+_LONGEST_BYTES = 1_000_000  # a latch has some hundred
 # Reporting first and writing meanwhile forgot 3 of 7 trips whose process was killed at that moment.
 WITHIN_S = 0.25
 """How long the guard's loop waits for the disk before it makes safe: a written and synced file takes 1 to 20 ms on a

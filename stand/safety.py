@@ -20,7 +20,7 @@ from thermostand.foundation.tasks import first_of
 # Below the 15 s of the relay board's own timer.
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
 _PAUSE_S = 1.0  # between tries
-_REPORTED_AFTER_S = 60.0
+_REPORTED_AFTER_S = 60.0  # round number; nothing was measured
 _GIVEN_UP_AFTER_S = 60.0  # before that, a second signal does not end it
 
 

@@ -20,7 +20,7 @@ from thermostand.foundation.errors import ConfigError, Refused, Unreachable
 from thermostand.stand.config.simulation import SimulatedCamera
 from thermostand.stand.config.stand_config import StandConfig, packaged
 
-_STOP_LIMIT_S = 5.0
+_STOP_LIMIT_S = 5.0  # round number; nothing was measured
 _CONNECT_S = 5.0
 _TURN_US = 10_000  # how long the event loop may wait for an answer
 _CAMERA_BOOT_S = 3.0  # a stand that waits for less has a camera that takes less

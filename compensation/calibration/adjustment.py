@@ -312,7 +312,7 @@ _MEDIAN_LENGTH = 1.18
 # With more than 2 % beyond, nothing is dropped: that is no set of stray markers but a wrong target or a wrong order.
 # Round number; nothing was measured.
 _MOST_OUTLIERS = 0.02
-_CLOSE_TO_ONE = 0.02
+_CLOSE_TO_ONE = 0.02  # of chi^2, when a discrepancy is fitted: its standard deviation is then 1 % off at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)

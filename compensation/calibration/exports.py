@@ -19,7 +19,7 @@ from thermostand.compensation.calibration.pinhole import Pinhole
 from thermostand.compensation.calibration.uncertainty import grid_pixels
 from thermostand.foundation.files import make_folder, write_whole
 
-_GRID_COLUMNS = 33
+_GRID_COLUMNS = 33  # round number; nothing was measured
 
 
 @dataclass(frozen=True, slots=True)

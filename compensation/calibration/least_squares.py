@@ -21,8 +21,8 @@ State = TypeVar("State")
 
 # A bound only: a fit that takes as many steps does not converge.
 _STEPS = 200
-_FIRST_DAMPING = 1e-6
-_GREATEST_DAMPING = 1e8
+_FIRST_DAMPING = 1e-6  # nearly Gauss-Newton from the first step on, since OpenCV and the poses give the start
+_GREATEST_DAMPING = 1e8  # steps are then too short to lower anything: the fit has failed
 _CONVERGED = 1e-7
 """Expected fall of the sum of squares, relative to it (or to 1): a small part of any parameter's standard deviation."""
 

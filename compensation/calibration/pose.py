@@ -18,7 +18,7 @@ from thermostand.compensation.calibration.least_squares import Float, dense, min
 from thermostand.compensation.calibration.pinhole import crosses
 from thermostand.foundation.errors import CalibrationError
 
-_LEAST_MARKERS = 4
+_LEAST_MARKERS = 4  # eight numbers for the six of a pose
 
 
 class Lens(Protocol):

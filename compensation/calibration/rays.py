@@ -22,7 +22,7 @@ from thermostand.foundation.errors import CalibrationError
 DEGREES = (3, 4, 5)
 # A bound only: Newton's steps end when they are below _PROJECTED_PX.
 _PROJECTIONS = 20
-_PROJECTED_PX = 1e-9
+_PROJECTED_PX = 1e-9  # far below any marker's noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,8 +29,8 @@ LEAST_COMMON = 3
 # Cameras that are fixed to each other turn by far less between moments; half-turned names of a symmetric target give
 # 180 degrees.
 _GREATEST_PLAY_DEG = 5.0
-_ROUNDS = 10
-_SETTLED = 0.02
+_ROUNDS = 10  # a bound only: rounds end when all cameras' chi^2 are settled
+_SETTLED = 0.02  # of chi^2, as for one camera
 
 Mask = NDArray[np.bool_]
 

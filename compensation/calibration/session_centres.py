@@ -110,8 +110,8 @@ def place(session: Session, axis: Axis, visit: TableVisit) -> float:
 
 
 ROLE = "calibration"
-_LEAST_MARKERS = 12
-_LEAST_POSITIONS = 5
+_LEAST_MARKERS = 12  # round number; nothing was measured
+_LEAST_POSITIONS = 5  # round number; nothing was measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)

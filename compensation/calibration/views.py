@@ -100,16 +100,16 @@ def _two_digits(value_um: float) -> str:
 
 POSE = 6
 """Parameters of a view: a turn (rad) and a shift (mm), in the camera's frame."""
-LEAST_VIEWS = 5
-LEAST_MARKERS = 12
+LEAST_VIEWS = 5  # round number; nothing was measured
+LEAST_MARKERS = 12  # round number; nothing was measured
 # Round number; nothing was measured. With less tilt the focal length cannot be separated from the distance.
 _LEAST_TILT_DEG = 10.0
-_ROUNDS = 10
+_ROUNDS = 10  # a bound only: rounds end when chi^2 is settled
 # One in 10^7 markers of normal noise lies beyond 6 sigma in two coordinates; half of it would drop one in a hundred.
 _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
-_SETTLED = 0.02
-_FOLDS = 5
+_SETTLED = 0.02  # of chi^2
+_FOLDS = 5  # the usual number; time grows in proportion
 
 
 @dataclass(frozen=True, slots=True, eq=False)

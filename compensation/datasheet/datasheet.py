@@ -105,7 +105,7 @@ def pooled(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
 SET_POINTS = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 MOTIONS = ("shift_I", "shift_J", "scale", "turn")
 UNITS = ("px", "px", "ppm", "µrad")
-_FEWEST_MARKERS = 4
+_FEWEST_MARKERS = 4  # as many motions are looked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,7 +253,7 @@ def _jackknife(values: Float, statistic: Callable[[Float], float]) -> float:
 
 NAMES = ("Shift of the image, I (right)", "Shift of the image, J (down)", "Scale of the image", "Turn of the image")
 _GROUP = "Temperature coefficients"
-_FEWEST_VISITS = 8
+_FEWEST_VISITS = 8  # five coefficients are fitted to them
 # At 0.9 the uncertainty grows by a factor of 4.4; at 1 it would be without bound.
 _MOST_CORRELATION = 0.9
 _MODEL = (
@@ -324,8 +324,8 @@ def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> Ite
 UNREPEATED = "what the chosen form leaves unexplained"
 _SWITCHING_ON = "Switching on"
 _NAMES = ("Drift in the warm-up, I", "Drift in the warm-up, J", "Change of scale in the warm-up")
-_SETTLED = 0.9
-_LAST_S = 300.0
+_SETTLED = 0.9  # the usual 90 % of a settling time
+_LAST_S = 300.0  # round number; nothing was measured
 _MOST_EXPONENTIALS = 10
 _NO_WARM_UP = "no warm-up was recorded at the reference's place"
 _OF_RESIDUALS = "residuals of a line and exponentials"

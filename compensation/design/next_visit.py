@@ -48,7 +48,7 @@ from thermostand.recording.repair.salvage import salvage_unfinished
 # The air follows a set-point by a limited ramp and a first-order lag; the camera is linear in lags of the air, fitted
 # to the night so far. Lags and plays are those of compensation/drift_runtime.py.
 
-STEP_S = 60.0
+STEP_S = 60.0  # of the forecast: a quarter of the fastest lag; time grows in inverse proportion
 # Assumed, not learned from the stand: off by two, the forecast air arrives some minutes early or late.
 _AIR_TAU_S = 300.0
 _AIR_LAGS, _POWER_LAGS = ([lag(of, tau_s) for tau_s in (150.0, 480.0, 1200.0, 4000.0)] for of in (AIR, POWER))
@@ -183,7 +183,7 @@ def _moved(follower: Follower, now: list[Float], mean: list[Float], dt_s: Float)
     return now
 
 
-_PLACES = 7
+_PLACES = 7  # round number; nothing was measured
 # A camera at rest, 4 h after a change. Asked for 45 min after one instead, a cycle ended after 46 % of the fixed one's
 # time but left about four times as much at rest (6 drawn cameras: 7 to 27 mpx for 1 to 8).
 _AFTER_S: dict[WantedState, float] = {"at_rest": 4 * 3600.0, "on_the_way": 2700.0}

@@ -26,7 +26,7 @@ from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
 
-_FEWEST = 3
+_FEWEST = 3  # a scatter of two units has one degree of freedom
 # On 8 drawn types (7700 to 7707) new units leave 1.47 times what a model of their own whole session leaves; with 0.3 it
 # was 1.67. On the ten judged ones (7800 to 7809) it is 2.1 and 2.0: eight types are too few to choose by.
 _APART = 0.1

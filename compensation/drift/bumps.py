@@ -131,9 +131,9 @@ _FORGOTTEN_S = (900.0, 3600.0, 14400.0)
 # A scan takes time with the cube of it. Longer sessions get coarser instants, up to 16 min; around a step that was
 # found the session is looked at again minute by minute.
 _MOST_INSTANTS = 160
-_SAME_PLACE_PX = 10.0
+_SAME_PLACE_PX = 10.0  # no drift is as large: the camera was moved or rolled
 _INSTANT_NS = 60 * NS_PER_S
-_FEWEST = 8
+_FEWEST = 8  # instants; fewer tell nothing of a step
 _QUICK_S = 1200.0
 """So soon after switching on the image moves faster than any lag of these tells."""
 

@@ -23,7 +23,7 @@ PAPER_BEFORE_PX = (0.191, 0.576)
 PAPER_AFTER_PX = (0.100, 0.090)
 """RMS along I and J of the paper's camera, fourth degree (section 6.2)."""
 
-_SIGMA_95 = 1.959964
+_SIGMA_95 = 1.959964  # of a normal distribution
 
 
 @dataclass(frozen=True, slots=True)

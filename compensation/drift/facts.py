@@ -21,7 +21,7 @@ from thermostand.foundation.errors import SessionError
 
 # A step of the image in a night: what is recorded of one that was found.
 
-MOTIONS = 4
+MOTIONS = 4  # shift along I and J, turn, scale
 
 
 class Bump(Document):

@@ -201,8 +201,8 @@ class PaperModel(DriftModel):
 
 # The paper's polynomial: choose its degree by temperatures left out, fit it, and say how far it can be trusted.
 
-_LEAST_TEMPERATURES = 3
-_LEAST_RANGE_K = 1.0
+_LEAST_TEMPERATURES = 3  # of a line and what it leaves
+_LEAST_RANGE_K = 1.0  # round number; nothing was measured
 
 
 def fit_paper(observations: Observations, degree: int | None = None) -> PaperModel:

@@ -24,8 +24,8 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.plugins import load_point
 
 GROUP = "thermostand.drift_terms"
-MOTIONS = 8
-_QUICK_S = 240.0
+MOTIONS = 8  # of a homography: shift (2), affine (4), perspective (2)
+_QUICK_S = 240.0  # the quickest of the usual lags
 # Slow lags have a width of their own: with one for all lags a sag was explained by coefficients of hours, and a colder
 # start was wrong by 15 to 60 mpx (24 drawn cameras, numbers 3000 on).
 _SLOW_S = 12600.0

@@ -188,7 +188,7 @@ def _most_likely(known: _Equations, motion: int, group: Index, start: Float) -> 
     return float(result.fun), np.asarray(result.x, np.float64)
 
 
-_FEWEST_FOLDS = 3
+_FEWEST_FOLDS = 3  # as in candidates.FEWEST_BETWEEN
 # Round number; nothing was measured. With fewer common set-points the comparison of sessions would be an extrapolation.
 _MOST_OF = 0.8
 _GUESSED_K = 5.0

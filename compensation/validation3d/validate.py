@@ -219,7 +219,7 @@ def _field(pixels: Float, covariance_px2: Float, length_px: float) -> Float:
     return (sigma[:, :, None, None] * field * sigma).reshape(2 * len(pixels), -1)
 
 
-_LEAST_MARKERS = 12
+_LEAST_MARKERS = 12  # as for a calibration; round number, nothing was measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ from thermostand.foundation.clock import Clock, call_pause_s
 from thermostand.foundation.errors import DeviceError, Refused, Unreachable
 from thermostand.foundation.readings import Channel, Reading, bad_reading
 
-_GAP_S = 0.02
+_GAP_S = 0.02  # between a reply and the next request; round number, nothing was measured
 _FAILED = re.compile(r"\*+")  # in the place of a number: not measured
 
 

@@ -21,7 +21,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
 from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
 
-PLAUSIBLE_DEGC = (-40.0, 100.0)
+PLAUSIBLE_DEGC = (-40.0, 100.0)  # wider than the stand's set-points, so that a broken wire is outside
 
 Role = Literal["air", "granite_inside", "granite_outside", "artifact", "laboratory", "safety"]
 PLACES: tuple[Role, ...] = get_args(Role)[:-1]

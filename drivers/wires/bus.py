@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 READ_RETRIES = 2
 DEAD_AFTER_FAILURES = 5  # transactions: one read with its repeats, and two more
 PROBE_PERIODS_S = (1.0, 2.0, 4.0, 8.0, 10.0)  # of a dead unit, the last for good
-REOPEN_PERIOD_S = 1.0
+REOPEN_PERIOD_S = 1.0  # round number; nothing was measured
 # Modbus RTU has no transaction numbers: after any error the bus is silent for longer than the slowest reply, then
 # flushed. In the soak test no value was wrong with it, some were without.
 QUARANTINE_MARGIN_S = 0.05

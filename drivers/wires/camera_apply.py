@@ -30,7 +30,7 @@ GAIN_TOLERANCE_DB = 0.5
 FRAME_RATE_TOLERANCE = 0.02
 
 LEAST_HEARTBEAT_S = 1.2  # Aravis asks each second
-LEAST_RECEIVE_BUFFER_BYTES = 1 << 20
+LEAST_RECEIVE_BUFFER_BYTES = 1 << 20  # round number; nothing was measured
 RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
 

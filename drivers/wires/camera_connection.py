@@ -50,7 +50,7 @@ from thermostand.foundation.readings import Cause
 INITIAL_PACKET_TIMEOUT_US = 1_000
 PACKET_TIMEOUT_US = 40_000
 PACKET_REQUEST_RATIO = 1.0
-FRAME_RETENTION_PERIODS = 0.9
+FRAME_RETENTION_PERIODS = 0.9  # below 1, so that Aravis gives a frame up before we stop waiting for it
 SOCKET_BUFFER_FIXED = 0
 
 # Bootstrap registers (GigE Vision 1.2, section 28): timestamp control and latched value.
@@ -58,7 +58,7 @@ TIMESTAMP_CONTROL, TIMESTAMP_LATCH = 0x0944, 2
 TIMESTAMP_HIGH, TIMESTAMP_LOW = 0x0948, 0x094C
 # A latch whose question and answer took longer than 5 ms is repeated, and the best of three is kept.
 LATCH_TRIES = 3
-LATCH_GOOD_NS = 5_000_000
+LATCH_GOOD_NS = 5_000_000  # a round trip; the error of the offset is half of it
 LATCH_AGAIN_S = 60.0  # two quartzes 50 ppm apart: 3 ms
 
 TEMPERATURE_AGAIN_S = 60.0  # between two looks that take the seconds of a time-out
@@ -72,7 +72,7 @@ TRANSFER_TIMEOUT_S = 2.0  # real seconds beyond the exposure: read-out, 5 MB on 
 # Held up by a busy host in the middle of a frame, a simulator lost it after 450 ms, and two runs of one seed differed.
 # A run that never gets its frame pays a minute for this.
 VIRTUAL_TIMEOUT_S = 20.0  # in virtual time a host that is busy must not make another session: a frame may stop half way
-CONTROL_RETRY_S = 1.0
+CONTROL_RETRY_S = 1.0  # round number; nothing was measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ import serial
 from thermostand.foundation.addresses import SerialPlace, TcpPlace, place_of, stated
 from thermostand.foundation.errors import Unreachable
 
-_CONNECT_S = 1.0
+_CONNECT_S = 1.0  # round number; nothing was measured
 _WRITE_S = 1.0  # a device that takes no bytes must not hold the caller
 _READ_SIZE = 4096
 CLOSING_S = 0.02  # from a reply to the end of its connection: a round trip of a slow network

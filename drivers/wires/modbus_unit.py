@@ -25,7 +25,7 @@ from thermostand.drivers.wires.registers import (
 )
 from thermostand.foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 
-WRITE_TRIES = 2
+WRITE_TRIES = 2  # a write is read back, so a second one does no harm
 CONFIRM_LOOKS = 3  # a status bit may lag its command by a scan of the unit
 FORMATS: dict[PointType, str] = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
 _SMALLEST = 1e-30  # a float of exchanged words is next to nothing: 25.0 would be 2.4e-41

@@ -30,7 +30,7 @@ from thermostand.recording.reading.run_word import Files, RunOutcome
 
 MANIFEST = "archive.json"
 KEEP_TAG = "keep"  # a session with this tag is never deleted
-_BLOCK_BYTES = 1 << 22
+_BLOCK_BYTES = 1 << 22  # round number; nothing was measured
 _SPARE_BYTES = 100_000_000  # left free at the place of the copies
 _OVER = (RunOutcome.COMPLETE, RunOutcome.STOPPED, RunOutcome.TRIPPED, RunOutcome.FAILED)
 

@@ -23,7 +23,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import frames_topic
 from thermostand.recording.writing.segment import Topic
 
-_CHUNK_BYTES = 1 << 22
+_CHUNK_BYTES = 1 << 22  # round number; nothing was measured
 
 
 def export_mcap(

@@ -41,7 +41,7 @@ META_SCHEMA: str = FRAME_META_CLASS.DESCRIPTOR.full_name
 # Measured on 5 MP frames of the demo: 7.6 ms of a processor in, 2.6 out, 2.87 MB of 5.0. Levels 2 and 3 are 2 % smaller
 # and take 3 to 7 times as long; noise of 1.5 DN without vignetting is the worst case, 1.78 times a PNG.
 ZSTD_LEVEL = 1
-MOST_WINDOWS = 10_000
+MOST_WINDOWS = 10_000  # more than any target has markers
 # A sixteenth of the pixels; the median of a ground is known from far fewer. Round number; nothing was measured.
 FILL_STEP_px = 4  # the median is taken of every fourth pixel of every fourth row
 

@@ -20,7 +20,7 @@ SESSION_CRC = "session_crc32"
 # Of the files, in the record `session`. From 0.2.0 on formats are kept: each version of the program reads those of all
 # before it. What earlier, unreleased versions recorded is not read.
 FORMAT = 3
-_FORMAT_DIGITS = 4
+_FORMAT_DIGITS = 4  # a longer number is no format
 
 
 def unknown_format(session: Mapping[str, str]) -> str:

@@ -25,7 +25,7 @@ from thermostand.recording.format.utc_offsets import UtcOffsets
 
 # At 1 Hz up to four missed polls are no hole. Round numbers; nothing was measured.
 SHORTEST_NS = 5 * NS_PER_S
-MEDIANS = 3
+MEDIANS = 3  # round number; nothing was measured
 _LAST_BLOCK = 2**62
 _RHYTHM = 3  # readings; with fewer there is no spacing to compare with
 

@@ -23,7 +23,7 @@ from thermostand.recording.format.journal_lines import damage_text, journal_line
 
 NOTES_NAME = "notes.jsonl"
 LONGEST_NOTE = 4000  # characters
-LIMIT_BYTES = 4_000_000
+LIMIT_BYTES = 4_000_000  # a thousand of the longest notes
 TAG = re.compile(r"[^\W_][\w.:+-]{0,39}")
 _HEAD_BYTES = 20  # of a line, with its end
 _APPENDING = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK

@@ -142,8 +142,8 @@ def _contents(data: memoryview) -> ChunkContents:
 # its end: crc(AB) = crc(A) x^(8 |B|) + crc(B) modulo the generator (zlib's crc32_combine). Those up to every 4 KiB are
 # kept; the file is read once, however many stretches are asked for.
 
-_STEP_BYTES = 1 << 12
-_READ_BYTES = 1 << 20
+_STEP_BYTES = 1 << 12  # a sector of today's disks
+_READ_BYTES = 1 << 20  # round number; nothing was measured
 _GENERATOR = 0xEDB88320  # of CRC-32, the lowest bit is the highest power
 _ONE = 1 << 31
 

@@ -15,7 +15,7 @@ from thermostand.recording.writing.disk import MODULE
 
 # Round number; nothing was measured.
 _LEFT_WITHIN_S = 2.0
-_AGAIN_S = 0.02
+_AGAIN_S = 0.02  # round number; nothing was measured
 
 
 def lock(fd: int) -> None:

@@ -53,7 +53,7 @@ from thermostand.recording.writing.notices import disk_space
 # A telemetry segment of ten minutes has 600 chunks of a second's commit each; merged it is read three times as fast.
 MANY_CHUNKS = 32  # opening a chunk takes a reader as long as a dozen messages
 FILE_SYSTEM_BYTES = 1_000_000  # never reserved: the file system needs blocks of its own to hold a reserve
-CHUNK_BYTES = 1024 * 1024
+CHUNK_BYTES = 1024 * 1024  # of a rewritten telemetry segment; a frame is a chunk of its own
 _KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE, linux/falloc.h
 _NO_RESERVE = (errno.EOPNOTSUPP, errno.ENOSYS)  # a file system that cannot reserve is written to without
 _PARTS_AT_ONCE = 1024  # IOV_MAX

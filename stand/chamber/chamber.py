@@ -20,7 +20,7 @@ from thermostand.stand.chamber.keeper import Keeper
 from thermostand.stand.chamber.permits import PermitLimits, Permits
 from thermostand.stand.interlock import Interlock
 
-_OCCUPIED_AGAIN_S = 5.0
+_OCCUPIED_AGAIN_S = 5.0  # round number; nothing was measured
 _STEP_K = 0.5  # of a set-point that is brought to its place no faster than the cameras may follow
 
 

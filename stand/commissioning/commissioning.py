@@ -133,7 +133,7 @@ def _identities(assembly: Assembly) -> dict[str, Identity]:
 
 # The computer a stand is run from: whether its disk keeps up with the cameras, and whether its clock is right.
 _PIECES, _PIECE_BYTES = 8, 4_000_000
-_SLOWEST_FLUSH_S = 1.0
+_SLOWEST_FLUSH_S = 1.0  # a commit is due each second
 _MARGIN = 2.0  # how much faster than the cameras a disk has to be
 _FRAME_BYTES = 2448 * 2048  # of a camera whose size is not in the stand's file
 _LEAST_MB_s = 10.0

@@ -20,7 +20,7 @@ from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Quality
 from thermostand.stand.assembly import Assembly
 
-_FRAMES = 6
+_FRAMES = 6  # enough for a rate; round number, nothing was measured
 _SLOW = 0.8  # of the longest travel that the stand's file allows
 _MOST_APART_K = 10.0  # a chamber so far from its laboratory keeps its flap shut
 

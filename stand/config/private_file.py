@@ -9,7 +9,7 @@ from pathlib import Path
 from thermostand.foundation.documents import Model, parse_document
 from thermostand.foundation.errors import ConfigError
 
-_LARGEST_BYTES = 100_000
+_LARGEST_BYTES = 100_000  # a token has some dozen
 
 
 def private_document(path: Path, key: str, model: type[Model], form: str) -> Model:

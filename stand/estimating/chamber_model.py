@@ -31,7 +31,7 @@ _LEAST_RAMP_K = 1.5  # smaller steps drown in the display's 0.1 K
 _HALF_DIGIT_K = 0.05
 _LEAST_CAMERA_CHANGE_K = 1.0  # within half a dwell; cameras report their temperature in steps of 0.1 to 0.5 K
 _CAMERA_MEAN_S = 60.0  # several such steps are averaged
-_FIT_POINTS = 41
+_FIT_POINTS = 41  # factors that are tried; round number, nothing was measured
 _PRIOR_S = 0.5  # what a factor of e away from the defaults must gain in the mean error
 
 _SETS = ("start_chamber", "set_temperature")

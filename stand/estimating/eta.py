@@ -20,8 +20,8 @@ from thermostand.stand.gate import HELD, RELEASED
 # Round numbers; nothing was measured.
 _REMEMBERED = 9  # the last measurements of a kind of work count
 _LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
-_LEAST_WITHIN_S = 60.0
-_LEAST_SHARE = 0.5
+_LEAST_WITHIN_S = 60.0  # nobody plans by less; round number, nothing was measured
+_LEAST_SHARE = 0.5  # of what is left must be of known kinds of work; round number, nothing was measured
 
 
 class Eta:

@@ -24,7 +24,7 @@ from thermostand.stand.latch import Latch
 from thermostand.stand.safety import Safety
 
 _GUARD_FAILED = guard_rule("guard_failed", "the guard itself has failed")
-LATE_PERIODS = 2
+LATE_PERIODS = 2  # one look may be late by as much as a period without anything being wrong
 _STRADDLING_S = 1.0  # a reply that lay in a buffer while the process was stopped is read within this after it continues
 # Round number; nothing was measured.
 _ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more often needs an operator

@@ -16,7 +16,7 @@ from thermostand.stand.guarding.plausibility import remembering
 OUTPUT_NOT_AS_NEEDED = guard_rule(
     "output_not_as_needed", "the regulator needs another output than before for the same set-point"
 )
-_FLAP_OPEN_ABOVE = 0.05
+_FLAP_OPEN_ABOVE = 0.05  # as in interlocks.py
 _BAND_K, _MEAN_S = 2.0, 300.0  # at its set-point; the cycles of a relay's output are a minute
 # In proportion, set-points twice as far apart differ by 20 %, close to the limit of 25.
 _NEAR_K = 3.0  # a set-point so near needs the same within 10 % in good nights

@@ -10,7 +10,7 @@ from thermostand.foundation.events import COOL_DOWN_UNSURE, COOLED_DOWN
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Quality, Reading
 
-_LOOK_S = 10.0
+_LOOK_S = 10.0  # round number; nothing was measured
 
 
 @dataclass(frozen=True, slots=True)

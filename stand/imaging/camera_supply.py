@@ -22,7 +22,7 @@ from thermostand.stand.imaging.cameras import Cameras
 from thermostand.stand.imaging.equilibrium import CAMERA, CameraEquilibrium
 from thermostand.stand.interlock import Interlock
 
-_BOOT_LIMIT_S = 60.0
+_BOOT_LIMIT_S = 60.0  # round number; nothing was measured
 
 
 @dataclass(frozen=True, slots=True)

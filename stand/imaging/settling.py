@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-COVERAGE = 2.0
+COVERAGE = 2.0  # k: an interval of two standard uncertainties holds 95 %
 # A soak waits longer in proportion where the display is coarse.
 _ROUNDING = 0.6  # digits over the time that is seen, as a standard uncertainty
 _LEAST_LOOKS = 4  # one more than a parabola needs
-_LEAST_MARKERS = 4
+_LEAST_MARKERS = 4  # shift, turn and scale are four
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from thermostand.stand.assembly import Assembly
 from thermostand.stand.serving.desk import Conflict, FaultRequest, Missing, SimulatedFaults
 from thermostand.stand.simulator import ControlSocket
 
-_ANSWERS_S = 5.0
+_ANSWERS_S = 5.0  # round number; nothing was measured
 
 
 async def simulated_faults(assembly: Assembly) -> SimulatedFaults:

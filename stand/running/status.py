@@ -23,7 +23,7 @@ from thermostand.stand.serving.desk import RunStatus
 
 # Says when the end of a run moves: an event each time it is later by another tenth of the whole.
 
-_SHARE = 0.1
+_SHARE = 0.1  # of the time that is left; round number, nothing was measured
 _LEAST_S = 300.0  # a minute's slip of a short run is not reported
 
 

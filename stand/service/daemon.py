@@ -62,7 +62,7 @@ Front = Callable[[StandService, Hub, WallClock], AbstractAsyncContextManager[obj
 _ENDS = Fault(STOPPED.rule, "the daemon was ended")
 _STOPPED_LOOK_S = 0.1  # whether the run has ended that was stopped
 _LOOK_S = 1.0  # at midnight, at what has to be kept, and for the watchdog
-_KEEP_EVERY_S = 60.0
+_KEEP_EVERY_S = 60.0  # what a kill costs of the counters; round number, nothing was measured
 _ENDED_AGAIN_S = 5.0  # between two records that end by themselves
 
 

@@ -92,7 +92,7 @@ class Counters:
 
 NAME = "daemon.json"
 _KIND = "counters"
-_CLOSE_LIMIT_S = 1.0
+_CLOSE_LIMIT_S = 1.0  # round number; nothing was measured
 
 
 class KeptCounters(BaseModel):

@@ -29,7 +29,7 @@ from thermostand.stand.running.resume import Interruption, interruption
 from thermostand.stand.service.queue import finish, note_session, note_step, queued, take
 from thermostand.stand.service.queue_file import QueueEntry, QueueState
 
-MOST_FRUITLESS_STARTS = 3
+MOST_FRUITLESS_STARTS = 3  # round number; nothing was measured
 _NOTED_WITHIN_S = 1.0  # real seconds that a disk may take for the note of a run's end; it is written later, then
 
 

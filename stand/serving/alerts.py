@@ -119,7 +119,7 @@ _LOOK_S = 0.5
 _BEAT_S = 1.0
 _LATE_NS = seconds_ns(15.0)  # an event loop that has not come round for so long is not well
 _AGAIN_S = (15.0, 60.0, 300.0, 1200.0)  # after a try that failed: networks come back
-_MOST_WAITING = 100
+_MOST_WAITING = 100  # round number; nothing was measured
 _FAREWELL_S = 5.0  # real seconds for the last messages
 _TELL, _ALIVE = "tell", "alive"
 

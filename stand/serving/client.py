@@ -27,7 +27,7 @@ from thermostand.stand.serving.desk import StandState
 from thermostand.stand.serving.presence import STOP_SUFFIX, LiveDaemon, address_in, living, opened_folder
 
 API = "/api/v1"
-LIMIT_S = 5.0
+LIMIT_S = 5.0  # as bridge.COMMAND_LIMIT_S
 _DISK_LIMIT_S = 1.0  # the disk of a session is asked no longer than this: it may hang
 
 Result = TypeVar("Result")

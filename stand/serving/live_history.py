@@ -22,9 +22,9 @@ from thermostand.foundation.readings import Quality
 
 FINE_S, FINE_CELLS = 1.0, 4 * 3600
 COARSE_S, COARSE_CELLS = 10.0, 7 * 24 * 360
-MOST_CHANNELS = 64
-MOST_POINTS = 5000
-MOST_MARKS = 2000
+MOST_CHANNELS = 64  # round number; nothing was measured
+MOST_POINTS = 5000  # of a curve: more than a screen is wide
+MOST_MARKS = 2000  # round number; nothing was measured
 _HOLDS_S = 100.0  # how long a value holds without another; stages are polled every 30 s
 _UNKEPT = ("_raw",)  # resistances and currents behind temperatures: three curves for one thermometer
 

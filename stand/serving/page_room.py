@@ -41,7 +41,7 @@ _TYPES = {
 _RECIPE = re.compile(r"[a-z0-9][a-z0-9-]*")
 _LIMIT_S = 60.0  # to read a recorded session, at the lowest priority
 _MOST_CHANNELS_TEXT = 4000
-_DRIFT_LIMIT_S = 300.0
+_DRIFT_LIMIT_S = 300.0  # round number; nothing was measured
 _KEPT = 8  # sessions' curves and drifts
 
 Ns = Annotated[int, Query(ge=0, le=1 << 62)]

@@ -27,7 +27,7 @@ from thermostand.foundation.lock_file import is_at, remove, take, try_lock
 NAME = "thermostand"
 SYSTEM_FOLDER = Path("/run/lock") / NAME
 STANDS_FOLDER = Path("/run/lock") / f"{NAME}-stands"
-_BACKLOG = 1024
+_BACKLOG = 1024  # round number; nothing was measured
 STOP_SUFFIX = ".stop"
 _SOCKETS = (".sock", STOP_SUFFIX)
 

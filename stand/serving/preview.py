@@ -21,7 +21,7 @@ from thermostand.markers.plane import project, roll_deg
 from thermostand.markers.target import Target
 from thermostand.stand.serving.shot import DRIFT_ROLES, FrameShot, Image
 
-_JPEG_QUALITY = 80
+_JPEG_QUALITY = 80  # for the page only: the markers are found in the frame itself
 _BINS = 64
 _EDGE_10_90 = 2.5631  # from 10 to 90 % of a Gaussian edge, in its standard deviations
 _CORNER = np.array([(0, 0), (1, 0), (0, 1)])  # mm

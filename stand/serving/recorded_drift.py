@@ -16,7 +16,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.serving.preview import Previewer
 from thermostand.stand.serving.shot import DRIFT_ROLES, FrameShot, is_reference
 
-MOST_FRAMES = 120
+MOST_FRAMES = 120  # enough for a curve; each takes tens of ms at the lowest priority
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ SPOT_COLOURS = ("#009E73", "#E69F00", "#56B4E9")
 COORDINATES = (("I", I_COLOUR), ("J", J_COLOUR))
 PALE, ON_PALE = "#ececec", "#111111"
 """The ground of pictures, and ink on it: both stay as they are where a page is dark."""
-FULL_WIDTH_IN = 7.4
+FULL_WIDTH_IN = 7.4  # of a printed page between its margins
 _LONGEST_ARROW = 0.06
 """Of the image's width: a typical large one."""
 LAYOUT: Literal["constrained"] | None = "constrained"
@@ -63,9 +63,9 @@ _STYLE = {
 _NO_METADATA = {"Date": None, "Creator": None, "Type": None, "Format": None}
 _RASTER_DPI = 150
 _LEGEND_MARKER = 3.5
-EXAGGERATION = 100
-_PATH_POINTS = 600
-_SAME_VIEW_PX = 5.0
+EXAGGERATION = 100  # so that 0.1 px is seen as 10 px
+_PATH_POINTS = 600  # more only make the page larger
+_SAME_VIEW_PX = 5.0  # closer, the picture and the path are of one view; round number, nothing was measured
 _BOX = {"boxstyle": "square,pad=0.15", "facecolor": PALE, "edgecolor": "none", "alpha": 0.8}
 _GREY_STEP = 8
 """A coarser picture has no noise to store."""

@@ -50,7 +50,7 @@ from thermostand.markers.target import Target
 CURVE_POINTS = 400
 """Frames of a curve that are drawn; more only make the page larger."""
 _NS_PER_H, _S_PER_MIN = 3.6e12, 60.0
-_BETWEEN_SESSIONS_H = 0.5
+_BETWEEN_SESSIONS_H = 0.5  # for the eye
 MOVED_ON_PURPOSE = tuple(str(role) for role in (Role.CALIBRATION, Role.POSE, Role.REPEATABILITY))
 
 
@@ -203,7 +203,7 @@ def _gaps(gaps: Sequence[BranchDifference], index: int, *, after: bool = False) 
 
 
 _SIGMA_95 = 1.959964
-_MOST_DOTS = 20_000
+_MOST_DOTS = 20_000  # more only make the page larger
 _BINS = 60
 
 

@@ -27,7 +27,7 @@ from thermostand.foundation.document_faults import TAG
 from thermostand.foundation.errors import DeviceError, Unreachable
 from thermostand.foundation.readings import Channel
 
-LONGEST_EXPOSURE_S = 10.0
+LONGEST_EXPOSURE_S = 10.0  # as in recipes (experiments/parameters.py)
 _IP_MTU = 14  # linux/in.h
 _GVCP = 3956
 _ADVICE = "give it a lower frame_rate_hz, larger packets (packet_size, with jumbo frames), or a line of its own"

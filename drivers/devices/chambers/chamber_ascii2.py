@@ -18,7 +18,6 @@ from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguag
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import Unreachable
 
-# No checksum protects a reply: one with another number of fields or digits than the one before it is refused.
 _FIELD = re.compile(r"-?\d{3,4}\.\d")
 _DIGITS = re.compile(r"[01]{26}|[01]{32}")
 
@@ -120,6 +119,7 @@ class Language(ChamberLanguage):
             return None
         if len(found[0]) <= max(*self._settings.write_fields, 1):
             raise ValueError(f"{len(found[0])} fields, and write_fields is {list(self._settings.write_fields)}")
+        # No checksum protects a reply: one with another number of fields or digits than the one before it is refused.
         before, self._shape = self._shape, (len(found[0]), len(found[1]))
         if before not in (None, self._shape):
             raise ValueError(f"{self._shape[0]} fields and {self._shape[1]} digits, before {before[0]} and {before[1]}")

@@ -35,7 +35,7 @@ _TEMPERATURE = 1  # the first control variable; the second one is humidity
 _TYPE, _SERIAL_NUMBER = 1, 3  # what 99997 is asked for
 _RUNNING, _ALARM = 2, 8  # bits of 10012
 _IN_PROGRAM = "4"  # of 10010
-_MOST_MESSAGES = 50
+_MOST_MESSAGES = 50  # round number; nothing was measured
 _ALARM_MESSAGE = "1"  # of 17005
 _GRADIENTS = {11066: "upwards", 11070: "downwards"}  # K/min, 0 for none
 

@@ -40,9 +40,9 @@ from thermostand.foundation.items import Event, Item, Original
 from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
 
 _SUFFIXES = (".jpg", ".jpeg")
-_LARGEST_BYTES = 20_000_000
+_LARGEST_BYTES = 20_000_000  # round number; nothing was measured
 _MOST_AT_ONCE = 20  # files of one poll: after a pause, hundreds may wait
-_KNOWN_HASHES = 10_000
+_KNOWN_HASHES = 10_000  # a picture a minute for a week
 _SET_BACK_S = 120.0  # more than a picture takes from the imager into the folder, beyond the quickest of them
 _NONE_YET = "no picture yet"
 

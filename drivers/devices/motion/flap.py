@@ -53,10 +53,10 @@ _ERROR_NAMES = (
 
 # The drive reports no jam by itself: its duty is saturated and its feedback still, for JAM_S.
 _JAM_DUTY = 0.9  # of the configured maximum
-POLL_S = 0.05
-CONFIRMATIONS = 3
-JAM_S = 0.5
-JAM_COUNTS = 8
+POLL_S = 0.05  # round number; nothing was measured
+CONFIRMATIONS = 3  # looks in a row: one may be taken in passing
+JAM_S = 0.5  # ten looks; round number, nothing was measured
+JAM_COUNTS = 8  # of 4095; less is taken for the feedback's noise
 # Of the time between two looks no more than this counts: while nobody looks, because the event loop or the host was
 # held up, nothing is known of the flap. So a jam takes five looks at the least.
 _LONGEST_LOOK_S = 2 * POLL_S

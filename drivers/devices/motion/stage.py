@@ -29,8 +29,8 @@ from thermostand.foundation.readings import Channel, Quality, Reading
 _LINE = SerialSettings(baud=115200, stopbits=2)
 _MICROSTEPS = 256
 _MICROSTEP_MODE_256 = 9
-_POLL_S = 0.1
-_STOP_LIMIT_S = 2.0
+_POLL_S = 0.1  # round number; nothing was measured
+_STOP_LIMIT_S = 2.0  # round number; nothing was measured
 _HOME_LIMIT_S = 900.0  # the slowest profile crosses its whole travel at 100 steps/s
 # One full step: a stepper that has slipped is off by four.
 _ARRIVED_MICROSTEPS = 256

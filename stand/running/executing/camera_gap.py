@@ -32,8 +32,8 @@ from thermostand.stand.imaging.camera_cooling import CameraTemperature
 from thermostand.stand.imaging.equilibrium import CAMERA
 
 AIR = "thermometers.air"
-LIMIT_K = 1.0
-_WINDOW_S = 120.0
+LIMIT_K = 1.0  # round number; nothing was measured
+_WINDOW_S = 120.0  # round number; nothing was measured
 _STEADY_K = 0.2
 """How much a settled camera changes from one half of that window to the other. One that warms up with 400 s, as those
 of the simulator and of the paper do within a factor of two, and does so, is still 1.3 K from where it will be."""

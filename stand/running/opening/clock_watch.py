@@ -9,7 +9,7 @@ from thermostand.foundation.instants import duration
 from thermostand.recording.format.utc_offsets import REPEATED_NS, offset_event, step_event
 
 _PERIOD_S = PIECE_S
-_LIMIT_NS = seconds_ns(1.0)
+_LIMIT_NS = seconds_ns(1.0)  # time servers correct by less; round number, nothing was measured
 
 
 class ClockWatch:

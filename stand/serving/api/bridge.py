@@ -30,7 +30,7 @@ from thermostand.foundation.tasks import failure_text
 from thermostand.stand.serving.commands import STOP, Served
 from thermostand.stand.serving.desk import Done, PlanCheck, PlanStep, StandState, Who, WrittenStep
 
-_REFRESH_S = 0.5
+_REFRESH_S = 0.5  # twice a second, as often as a person sees a change
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
 _FRESH_S = 0.3  # so long one who asks for the state waits for a new one
 # The thread is never waited for: what it has not taken of so many items is dropped for viewers, never for the
@@ -38,7 +38,7 @@ _FRESH_S = 0.3  # so long one who asks for the state waits for a new one
 _QUEUE = 20_000  # items, which are some MB; the thread takes them four times a second at the least
 _PLAN_AGE_S = 5.0  # what a plan has earned and expects changes slowly; the begin or end of a step is shown at once
 _STOPPED_S = 0.1  # between two stops, from any client: a flood must not fill the recording
-COMMAND_LIMIT_S = 5.0
+COMMAND_LIMIT_S = 5.0  # a device is given its own time-outs
 _FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
 Result = TypeVar("Result")

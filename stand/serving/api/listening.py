@@ -21,7 +21,7 @@ from websockets.frames import CloseCode
 
 from thermostand.stand.serving.api.access import last_refusal, uid_of
 
-MOST_CLIENTS = 64
+MOST_CLIENTS = 64  # of 1,024 descriptors that a process usually has
 _UNREAD = 10  # looks, one a second, at an answer that is not read
 _FAREWELL_LIMIT_S = 1.0  # for clients that do not read their last answer
 # A browser answers a ping each 20 s with 10 bytes. A read counts as 64 bytes at least: eight a second, 64 at once.

@@ -106,7 +106,7 @@ def _escaped(text: str, *, quotes: bool = False) -> str:
 
 
 _OLD_S = 10.0  # a snapshot is made twice a second: the control loop hangs
-_SEND_LIMIT_S = 30.0
+_SEND_LIMIT_S = 30.0  # round number; nothing was measured
 _MOST_SEQ = 1 << 62
 _PAGE = (
     '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="refresh" content="0;url=/">'

@@ -24,7 +24,7 @@ from thermostand.stand.serving.desk import Missing
 REPORT = "report.html"
 # A report is a page of its own with styles and drawings in it: nothing in it may run, or ask this stand anything.
 REPORT_CSP = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
-_DISK_LIMIT_S = 20.0
+_DISK_LIMIT_S = 20.0  # a disk that slept needs some seconds; round number, nothing was measured
 
 SessionName = Annotated[str, FromPath(max_length=255)]
 Result = TypeVar("Result")

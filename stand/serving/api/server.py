@@ -31,8 +31,8 @@ from thermostand.stand.serving.presence import DaemonEntry, Presence
 _UNIX: tuple[Door, ...] = ("socket", "stop")
 _TCP: Door = "tcp"
 _LOOK_S = 1.0
-_CLOSE_LIMIT_S = 5.0
-_READY_LIMIT_S = 30.0
+_CLOSE_LIMIT_S = 5.0  # round number; nothing was measured
+_READY_LIMIT_S = 30.0  # imports take half a second or more
 
 
 @asynccontextmanager

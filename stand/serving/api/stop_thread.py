@@ -47,11 +47,11 @@ _MOST_WAITING = {"tcp": 64, "socket": 256, "stop": 0}  # to be handed over
 _AT_ONCE = 128  # with the rest about 6,000 connections a second, more than most floods of one machine make
 _REST_S = 0.01  # at most, however much is asked of this thread
 _MAY_SPEAK_S = 0.02  # between connecting and speaking, on a busy machine: who is younger is not sent away
-_HEAD_BYTES = 1 << 15
-_ASK_WITHIN_S = 10.0
+_HEAD_BYTES = 1 << 15  # of a request, beyond which it is refused; round number, nothing was measured
+_ASK_WITHIN_S = 10.0  # round number; nothing was measured
 _DRAIN_S = 1.0  # for what a client still sends: closed before it is read, the answer would be lost
 _LOOK_S = 0.1
-_SPARES = 2
+_SPARES = 2  # descriptors kept open, so that STOP is accepted when the process has no other left
 _REQUEST = f"POST {STOP_PATH}".encode()
 _CHUNKED = re.compile(rb"\n[Tt][Rr][Aa][Nn][Ss][Ff][Ee][Rr]-[Ee][Nn][Cc][Oo][Dd][Ii][Nn][Gg][ \t]*:")
 

@@ -27,7 +27,7 @@ READINGS = 3_000  # batches: some minutes; the page's history has the rest
 _QUEUE = 512  # messages that a viewer may be behind
 _BETWEEN_STATES = 32  # messages at most, for one that is behind
 _BUSY_S, _IDLE_S = 0.05, 0.25  # between looks for what is new, with and without viewers
-MOST_VIEWERS = 24
+MOST_VIEWERS = 24  # below listening.MOST_CLIENTS, so that requests still find a place
 
 Kind = Literal["state", "event", "reading", "gone"]
 

@@ -10,7 +10,7 @@ from pydantic import JsonValue
 from thermostand.stand.serving.secop.secop_lines import Refusal
 
 DataInfo = Mapping[str, JsonValue]
-TEXT_LIMIT = 200
+TEXT_LIMIT = 200  # round number; nothing was measured
 
 
 def double(unit: str = "", minimum: float | None = None, maximum: float | None = None) -> DataInfo:

@@ -36,9 +36,9 @@ _LOOK_S = 0.1
 _REST_S = 0.05  # for a client that has spent the budget
 _RECEIVE_BYTES = 4096
 _SEND_BYTES = 1 << 16
-_SEND_LIMIT_S = 10.0
+_SEND_LIMIT_S = 10.0  # round number; nothing was measured
 _SPEAK_WITHIN_S = 10.0  # the first request, from the first moment
-_NO_DESCRIPTOR_S = 0.1
+_NO_DESCRIPTOR_S = 0.1  # round number; nothing was measured
 _FAREWELL_S = 1.0
 
 

@@ -14,7 +14,7 @@ from pydantic import JsonValue
 
 IDENTIFICATION = "ISSE&SINE2020,SECoP,V2019-09-16,v1.0"  # clients compare the first two fields
 IDENTIFY = "*IDN?"
-LINE_LIMIT_BYTES = 1 << 14
+LINE_LIMIT_BYTES = 1 << 14  # round number; nothing was measured
 _ECHO = 200  # characters of what is not understood
 
 # What each word asks for, and the word of its answer.
