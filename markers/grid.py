@@ -425,6 +425,7 @@ def _same_window(one: GridPlacement, other: GridPlacement, target: Target) -> bo
     corners = target.nominal_mm()[[0, columns - 1, columns * (rows - 1), columns * rows - 1]]
     first, second = project(one.homography, corners), project(other.homography, corners)
     away = np.linalg.norm(first[:, None] - second[None], axis=2).min(axis=1)
+    # Half way to a window that is shifted by half a marker. Round number; nothing was measured.
     return bool(away.max() < 0.25 * pitch_px(one.homography, target))
 
 

@@ -83,6 +83,7 @@ def _lattice_vectors(points: Float, near: Index) -> tuple[Float, Float] | None:
     offset = points[near[1:10]] - points[near[0]]
     first = offset[0]
     for other in offset[1:]:
+        # At least 37 degrees off the first: from rendered poses up to 45 degrees of tilt.
         if abs(_cross(first, other)) > 0.6 * np.hypot(*first) * np.hypot(*other):
             return first, other
     return None

@@ -323,6 +323,7 @@ def limited(step: Float, p: Float, scale: float) -> Float:
     shorten = max(1.0, far, bend / (_GREATEST_BEND * 0.5 * (p[M11] + p[M22])))
     for i in range(PARAMETERS):
         step[i] /= shorten
+    # So that no step takes the blur through zero.
     step[SIGMA] = min(max(step[SIGMA], -0.4 * p[SIGMA]), 0.5 * p[SIGMA])
     return step
 

@@ -108,6 +108,7 @@ class Target(Document):
         if odd.number > self.count:
             raise ValueError(f"odd_marker.number is {odd.number}, but the target has {self.count} markers")
         ratio = odd.diameter_mm / self.diameter_mm
+        # Beyond these the areas differ by more than the factor of 1.6 within which spots count as alike (bootstrap.py).
         if 0.75 < ratio < 1.33:
             raise ValueError(f"odd_marker.diameter_mm differs too little from diameter_mm (ratio {ratio:.2f})")
         if odd.diameter_mm + self.diameter_mm >= 2 * self.spacing_mm:

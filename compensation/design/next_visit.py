@@ -122,6 +122,7 @@ def _air(observations: Observations) -> Float:
     if len(set_points) < 2 or np.ptp(set_points) < 2.0:
         return np.array([0.0, 1.0])
     slope, offset = np.polyfit(set_points, air, 1)
+    # Air that follows the set-point by less than half was not at rest; round numbers, nothing was measured.
     return np.array([offset, slope]) if 0.5 < slope < 1.5 else np.array([0.0, 1.0])
 
 

@@ -56,6 +56,7 @@ def condense_instants(observations: Observations, rows: Displacements, features:
     mean = np.stack([np.bincount(label, column[rows.frame]) / rows_of for column in features.T], axis=1)
     first = np.zeros(count, np.int64)
     first[label[::-1]] = rows.frame[::-1]
+    # As in the paper's form: beyond it the markers do not determine eight motions.
     good = (np.linalg.cond(normal) < 1e8) & np.isfinite(mean).all(axis=1)
     gram, normal, first = _gram(g, label, rows_of)[good], normal[good], first[good]
     covariance = np.linalg.inv(normal)

@@ -16,6 +16,7 @@ class ChamberConfig(Document):
     """
 
     heater_W: float = Field(default=2000.0, gt=0, le=20_000)
+    # Of the simulated chamber, as the lag below; drawn chambers differ from both by up to a third, and trip nothing.
     heat_capacity_Wh_K: float = Field(default=13.0, gt=0, le=1000)
     granite_lag_s: float = Field(default=4300.0, ge=60, le=100_000)
     camera_lag_s: float = Field(default=600.0, ge=10, le=10_000)

@@ -46,6 +46,7 @@ class SensorsConfig(Document):
     trip_K: float = Field(default=6.0, gt=0, le=20)
     trip_after_s: float = Field(default=120.0, ge=0, le=3600)
     jump_K: float = Field(default=2.0, gt=0, le=50)
+    # A drift of 10 mK/h then shows after ten hours.
     drift_K: float = Field(default=0.1, gt=0, le=5)
 
     @model_validator(mode="after")
@@ -94,6 +95,7 @@ class GuardConfig(Document):
     max_air_degC: float = Field(default=65.0, le=80)
     max_granite_degC: float = Field(default=60.0, le=80)
     max_camera_degC: float = Field(default=85.0, le=100)
+    # Three polls of the slowest kind. Twice as long, the heater runs for 30 s without a temperature.
     stale_after_s: float = Field(default=15.0, gt=0, le=120)
     # With all software gone the relay board ends the heat after this: 8 Wh at 2 kW, 0.6 K of a chamber of 13 Wh/K.
     heater_hold_s: float = Field(default=15.0, ge=2.0, le=60.0)
@@ -111,15 +113,19 @@ class GuardConfig(Document):
     startup_response: StartupResponseConfig = StartupResponseConfig()
     keys_s: float = Field(default=30.0, ge=1, le=600)
     flap_open_s: float = Field(default=300.0, gt=0, le=36000)
+    # 45 min. Round number; nothing was measured.
     flap_capture_s: float = Field(default=2700.0, gt=0, le=36000)
+    # Round number; nothing was measured.
     disk_low_s: float = Field(default=900.0, ge=0, le=36000)
     camera_temperature_s: float = Field(default=60.0, gt=0, le=36000)
     notify: tuple[Annotated[str, Field(min_length=1)], ...] = Field(default=(), max_length=100)
     notify_limit_s: float = Field(default=10.0, gt=0, le=60)
     accept: tuple[str, ...] = ()
+    # Round number; nothing was measured.
     pause_limit_h: float = Field(default=12.0, gt=0, le=24)
     channels: dict[str, ChannelLimits] = Field(default_factory=dict[str, ChannelLimits])
     added: dict[str, SerializeAsAny[Document]] = Field(default_factory=dict)
+    # Round number; nothing was measured.
     safe_limit_s: float = Field(default=600.0, ge=1, le=3600)
 
     _added = field_validator("added", mode="before")(added_rules)

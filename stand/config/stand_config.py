@@ -119,6 +119,7 @@ class RecordingConfig(Document):
     frame_encoding: Literal["zstd", "raw", "roi"] = "zstd"
     whole_every_s: float = Field(default=60.0, gt=0, le=86400)
     telemetry_commit_s: float = Field(default=1.0, gt=0, le=1)
+    # Round number; nothing was measured.
     durable_within_s: float = Field(default=60.0, ge=1, le=300)
     idle_log_days: int = Field(default=90, ge=0, le=36500)
     stop_frames_below_GB: float = Field(default=2.0, ge=0, le=1000)

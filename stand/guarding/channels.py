@@ -310,6 +310,7 @@ class ChannelCheck:
         needed_K = _STEPS_BEHIND * step_K / _share(_STALE_AFTER_S, _SLOWER * nature.lag_s)
         if nature.excess_K is not None and (seen.time_ns - seen.begin_ns) / NS_PER_S < _YOUNG_LAGS * nature.lag_s:
             needed_K *= max(1.0, step_K / _FINE_STEP_K)
+        # For a camera of the usual lag of 600 s the share is 0.63, and the limit is that of the air itself.
         if not went_K >= max(_AIR_MOVES_K / min(1.0, 1.6 * share), needed_K):
             return None
         seen.went_ns = seen.went_ns or seen.time_ns

@@ -126,6 +126,7 @@ def _not_risen(
     first, now = stretch.moments[0], stretch.moments[-1]
     lasted_s = (now.time_ns - first.time_ns) / NS_PER_S
     settled_ns = (stretch.since_ns or 0) + seconds_ns(_SETTLE_S)
+    # A poll may be late: nine tenths of the window count as all of it.
     if lasted_s < 0.9 * _WINDOW_S or first.time_ns < settled_ns:
         return None
     lacking_K = value_of(readings, f"{regulator}.sp") - value_of(readings, f"{regulator}.pv")
