@@ -105,7 +105,7 @@ def pooled(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
 SET_POINTS = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 MOTIONS = ("shift_I", "shift_J", "scale", "turn")
 UNITS = ("px", "px", "ppm", "µrad")
-_FEWEST_MARKERS = 4  # as many motions are looked for
+_FEWEST_MARKERS = 4  # eight numbers for four motions
 
 
 @dataclass(frozen=True, slots=True, eq=False)

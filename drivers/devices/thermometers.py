@@ -76,6 +76,7 @@ class ThermometerSettings(Calibration):
 
 def by_channel(thermometers: Mapping[str, ThermometerSettings]) -> dict[str, ThermometerSettings]:
     """The sensors by what they are read as: their place, or their own names."""
+    # By role, which models, reports and other programs look for in every session; its own name is in the stand's file.
     return {name if each.role is None or each.is_safety else each.role: each for name, each in thermometers.items()}
 
 

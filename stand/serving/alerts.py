@@ -140,6 +140,7 @@ async def alerting(
     """Alerts of the stand `name` while inside, none in virtual time or without alerts.secrets. is_well: whether the
     sign of life may be given, asked each second on the loop; what this knows of by itself (a hold, a lost device, a
     loop that stands still) counts besides. ConfigError as check_alerts."""
+    # A run in virtual time alarms nobody.
     if config.secrets is None or isinstance(clock, VirtualClock):
         yield
         return

@@ -84,6 +84,7 @@ _LAGS = {
 _ALONE = ("heater_W", "compressor_W", "probe_lag_s", "near_lag_s")
 
 
+# The limits of the guard were chosen on ten chambers drawn so, and judged on others.
 def drawn(seed: int, spread: float = 0.3) -> ChamberSpec:
     """Another chamber of the kind: every conductance, every lag, the heater and the compressor drawn independently and
     evenly within +-`spread` of the standard one's. A heat capacity is its lag times its conductance."""
@@ -102,6 +103,7 @@ STEP_s = 0.5
 STEP_ns = 500_000_000
 DAY_s = 86_400.0
 
+# Five kelvins above the highest limit that a stand's file may give.
 CUT_OUT_degC = 85.0  # hard-wired, latching
 
 # Laboratory side

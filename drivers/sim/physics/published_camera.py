@@ -21,6 +21,8 @@ from thermostand.drivers.sim.physics.optics import CameraDeformation, PITCH_mm, 
 from thermostand.drivers.sim.physics.wear import Fixings, Lag, Play, StickSlip
 
 CHIP, BODY, CELL, GLASS, MOUNT = range(5)
+# Assumed; what these parts move is published (configs/optics), and of what does not repeat nobody has published a
+# number.
 _CAPACITY_J_K = (25.0, 260.0, 180.0, 90.0, 900.0)
 _LOSS_W_K = (0.005, 0.14, 0.07, 0.012, 0.18)
 _JOINTS_W_K = ((CHIP, BODY, 0.35), (BODY, CELL, 0.25), (CELL, GLASS, 0.15), (BODY, MOUNT, 0.12))

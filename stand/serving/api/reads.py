@@ -25,6 +25,7 @@ _PHASES = ("idle", "running", "held", "stopping")
 _Sample = tuple[Mapping[str, str], float]
 
 
+# Written by hand: the snapshot has every number already, and a client library would keep them a second time.
 def metrics(snapshot: StateSnapshot, drops: int, viewers: int) -> str:
     """The whole page."""
     state = snapshot.state
