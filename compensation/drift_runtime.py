@@ -32,6 +32,7 @@ SETTLED_TAUS = 3.0
 """After so many time constants a state that began with a guess has forgotten it (5 % are left)."""
 COLD_K = 3.0
 """A camera this close to the air around it has been off for long: nothing of it is warm."""
+# Assumed. A camera with half or twice this time constant is guessed wrong by a quarter of its excess at most.
 UNPOWERED_TAU_S = 900.0
 """An unpowered camera reports no temperature; its excess over the air is assumed to decay so until it does."""
 HULL_MARGIN_PX = 1.0  # the markers themselves move by about so much

@@ -53,6 +53,7 @@ STEP_S = 60.0  # of the forecast: a quarter of the fastest lag; time grows in in
 _AIR_TAU_S = 300.0
 _AIR_LAGS, _POWER_LAGS = ([lag(of, tau_s) for tau_s in (150.0, 480.0, 1200.0, 4000.0)] for of in (AIR, POWER))
 _RIDGE = 1e-8
+# Time is in inverse proportion to it; readings each few seconds have no more to say of a camera that takes minutes.
 _EVERY_READING = 6
 """Of the camera's readings, for its fit: they come every few seconds, it moves within minutes."""
 

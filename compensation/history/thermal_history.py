@@ -113,6 +113,7 @@ def row_of(state: ThermalState) -> Float:
 
 TimesNs = NDArray[np.int64]
 
+# Time is in inverse proportion to it.
 _STEP_NS = 10 * NS_PER_S
 """How far the state is moved at once: the inputs' means over it are exact, and the fastest lag takes minutes."""
 

@@ -59,6 +59,7 @@ TIMESTAMP_HIGH, TIMESTAMP_LOW = 0x0948, 0x094C
 # A latch whose question and answer took longer than 5 ms is repeated, and the best of three is kept.
 LATCH_TRIES = 3
 LATCH_GOOD_NS = 5_000_000  # a round trip; the error of the offset is half of it
+# Twice as long, a time stamp may be off by 6 ms, still within STAMP_SLACK_NS.
 LATCH_AGAIN_S = 60.0  # two quartzes 50 ppm apart: 3 ms
 
 TEMPERATURE_AGAIN_S = 60.0  # between two looks that take the seconds of a time-out

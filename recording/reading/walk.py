@@ -326,6 +326,8 @@ def find_misplaced_chunks(chunks: Sequence[PlacedChunk], damages: Sequence[Span]
 # whole block was acknowledged, so damage that is longer than a block is a loss. Of a block of which nothing was written
 # the length is not known: it may be a quarter longer than any before.
 
+# Too small, the end of a power cut counts as a loss; too large, a loss of up to so many bytes counts as an unfinished
+# write.
 FIRST_BLOCK_BYTES = 1 << 14  # more than an opening, or a second's telemetry with its schemas, usually is
 
 

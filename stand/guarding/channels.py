@@ -38,6 +38,7 @@ Poll = tuple[Reading, ...]
 _DRIVE_K = 50.0
 """How far from a body its surroundings, or its own heat, may draw it: the largest step of the installed recipes is 36 K
 and the warmest camera 25 K above the air. In a gap a body of lag L can go no further than 1 - exp(-gap / L) of it."""
+# Half of 40 K is less than the 22 K of published chips.
 _CHIP_K, _CHIP_LAG_S = 40.0, 60.0
 """A chip on its board warms by so much within some minutes of switching on, and loses it as fast: those of the
 published cameras go up to 22 K, with lags between 40 and 130 s."""

@@ -18,6 +18,7 @@ _BEFORE_S = 30.0  # a stretch of heat begins: from here on a fall counts
 _MINUTE_S = 60.0
 HARD_PERCENT = 50.0
 """More than any rest needs: at such an output the air must warm."""
+# 60 s are 2.4 lags of the heater: 9 % are still to come. Half of it would leave 30 %.
 _WINDOW_S, _SETTLE_S = 120.0, 60.0  # over which it must rise, once the heater's own lag of 25 s is over
 # Half of it is 0.5 K above what good sessions do.
 _FALL_K = 4.0  # from its highest; good nights fall by 1.5 K, when a ramp passes a capture's open flap

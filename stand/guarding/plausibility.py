@@ -19,6 +19,7 @@ from thermostand.stand.fault import Fault, Readings, Rule, in_doubt, value_of
 
 WARMING_WHILE_OFF = guard_rule("warming_while_off", "the air warms though nothing heats")
 COOLING_IN_VAIN = guard_rule("cooling_in_vain", "cold is given and the air does not cool")
+# Five lags of the element; half of it leaves 9 % of its heat.
 _OFF_SETTLE_S, _ABOVE_SURROUNDINGS_K = 120.0, 5.0
 """So long after the heat went off its element, lag 25 s, and the walls may still warm the air; so far above all that
 surrounds it, nothing but heat keeps it."""
