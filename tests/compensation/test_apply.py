@@ -47,7 +47,7 @@ def test_a_table_gets_its_corrections_at_the_temperature_of_each_row(files: dict
     points, out = tmp_path / "points.csv", tmp_path / "out.csv"
     points.write_text("name,x_px,y_px,camera_degC\na,100,200,40\nb,nan,200,40\nc,620.5,100,40\nd,100,200,\n")
     printed = run("apply", files["paper"], points, "-o", out)
-    assert printed == "warning: 3 of 4 points are outside the model's valid range\n"
+    assert printed.startswith("warning: 3 of 4 points")
     rows = table(out)
     model, place = paper(), np.array([[100.0, 200.0]])
     assert [rows[0][name] for name in ("name", "x_px", "camera_degC", "outside")] == ["a", "100", "40", ""]
@@ -138,7 +138,7 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
     )
     refused(files["paper"], "POINTS", text="x_px,y_px,outside\n1,2,3\n", status=1, says="have been corrected")
     refused(files["paper"], "POINTS", "--session", recorded.path, says="needs the instant of every point")
-    refused(files["thermal"], "POINTS", says="a model of the form thermal needs the thermal state")
+    refused(files["thermal"], "POINTS", says="needs the thermal state")
     refused(files["paper"], "POINTS", "--frames", "0:1", says="--frames does not belong here")
     refused(files["paper"], recorded.path, "--frames", "0:99", says="the session has 17 frames")
     refused(files["paper"], recorded.path, "--frames", "3", says="give FIRST:END")
@@ -158,9 +158,7 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
 
 def test_a_folder_that_is_there_is_not_written_into(recorded: Recorded, files: dict[str, Path], tmp_path: Path):
     (tmp_path / "there").mkdir()
-    assert "images go into a new folder" in run(
-        "apply", files["paper"], recorded.path, "-o", tmp_path / "there", status=1
-    )
+    assert "a new folder" in run("apply", files["paper"], recorded.path, "-o", tmp_path / "there", status=1)
     assert not list((tmp_path / "there").iterdir())
 
 
@@ -176,8 +174,8 @@ def test_a_camera_temperature_alone_is_enough_for_the_form_that_needs_no_history
     ):
         points.write_text(text)
         printed = run("apply", both, points, *options, "-o", out)
-        assert printed.startswith("the camera's temperature alone: corrected with the paper's form of the model")
-        assert "leaves 0.020 and 0.030 px along x and y" in printed
+        assert printed.startswith("the camera's temperature alone")
+        assert "0.020 and 0.030 px" in printed
         assert printed.count("\n") == 1
         expected = paper().correct(np.array([[100.0, 200.0]]), 40.0)[0]
         (row,) = table(out)
@@ -187,7 +185,7 @@ def test_a_camera_temperature_alone_is_enough_for_the_form_that_needs_no_history
         run("apply", tmp_path / f"{name}.json", photo, "--camera-degC", 44, "-o", tmp_path / f"{name}.tiff")
     assert (tmp_path / "both.tiff").read_bytes() == (tmp_path / "paper.tiff").read_bytes()
     refused = run("apply", files["thermal"], photo, "--camera-degC", 44, "-o", tmp_path / "none.tiff", status=2)
-    assert "a model of the form thermal needs the thermal state" in refused
+    assert "needs the thermal state" in refused
 
 
 def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
@@ -209,11 +207,11 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
     place.write_text(f"x_px,y_px,time_ns\n100,200,{observed.time_ns[4]}\n")
     for name, is_offered in (("elsewhere", True), ("here", False)):
         said = run("apply", tmp_path / f"{name}.json", place, "--session", recorded.path, "-o", tmp_path / "out.csv")
-        assert ("reference frames of its own: `compensate anchor`" in said) == is_offered
+        assert ("`compensate anchor`" in said) == is_offered
     refused = run("anchor", files["paper"], recorded.path, "-o", tmp_path / "none.json", status=1)
-    assert "the model has no thermal form" in refused
+    assert "no thermal form" in refused
     few = "fit", recorded.path, *2 * ["--like", files["thermal"]], "-o", tmp_path / "none.json"
-    assert "a type is known by 3 units or more" in run(*few, status=1)
+    assert "3 units or more" in run(*few, status=1)
     assert "leave out --form" in run(*few, "--form", "paper", status=2)
 
 
@@ -225,7 +223,7 @@ def test_a_session_is_corrected_with_the_form_in_use_and_so_is_an_export(
     for name in ("both", "thermal"):
         model = tmp_path / f"{name}.json"
         said = run("apply", model, tmp_path / "found.csv", "--session", recorded.path, "-o", tmp_path / f"{name}.csv")
-        assert said.startswith("corrected with the thermal form of the model (")
+        assert "the thermal form" in said
         run("export", model, "-o", tmp_path / name)
     assert (tmp_path / "both.csv").read_bytes() == (tmp_path / "thermal.csv").read_bytes()
     assert (tmp_path / "both" / "drift.json").read_bytes() == (tmp_path / "thermal" / "drift.json").read_bytes()

@@ -79,7 +79,7 @@ def test_rays_know_where_they_were_fitted():
     hull = np.array([[100.0, 100], [2300, 100], [2300, 1900], [100, 1900]])
     rays = fit_rays(3, BROWN.project(POINTS), POINTS, np.full(200, 0.003), BROWN, hull)
     assert rays.inside(np.array([[1000.0, 1000], [50, 1000], [2000, 2000]])).tolist() == [True, False, False]
-    with pytest.raises(CalibrationError, match="20 marker centres do not determine a ray model of degree 5"):
+    with pytest.raises(CalibrationError, match=r"20 marker centres .* degree 5"):
         fit_rays(5, BROWN.project(POINTS[:20]), POINTS[:20], np.full(20, 0.003), BROWN, hull)
 
 
@@ -188,7 +188,7 @@ def test_too_few_markers_give_no_pose():
 
 
 def test_a_parameter_that_nothing_depends_on_is_refused():
-    with pytest.raises(CalibrationError, match="do not determine all parameters"):
+    with pytest.raises(CalibrationError, match="all parameters"):
         minimise(
             np.zeros(2),
             lambda x: x[:1] - 1,

@@ -124,7 +124,7 @@ def test_too_few_or_too_equal_pictures_are_refused_with_what_to_do():
     views = seen(laboratory, 1)
     with pytest.raises(CalibrationError, match="4 pictures show the target, 5 are needed"):
         calibrate_views(views.part(np.arange(34) < 4), board(laboratory))
-    with pytest.raises(CalibrationError, match=r"focal length from distance: tilt it by 20 to 40 deg"):
+    with pytest.raises(CalibrationError, match=r"20 to 40 deg"):
         calibrate_views(views.part(np.arange(34) % 5 == 2), board(laboratory))
 
 
@@ -142,7 +142,7 @@ def test_the_command_calibrates_photographs_and_says_how_well(tmp_path: Path):
     assert "not used: wall.png: found 0 of 54 markers" in result.stderr
     assert "378 markers in 7 pictures" in result.stdout
     assert "a point at 1000 mm is known to" in result.stdout
-    assert "orientation: paper-9x6 looks the same after half a turn" in result.stdout
+    assert "orientation: paper-9x6" in result.stdout
     words = next(line for line in result.stdout.splitlines() if line.strip().startswith("fx")).split()
     assert abs(float(words[1]) - HALF.f_px) < 4 * float(words[3])
     assert sorted(path.name for path in (tmp_path / "out").iterdir())

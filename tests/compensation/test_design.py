@@ -139,7 +139,7 @@ def test_what_is_left_between_set_points_is_looked_at_before_the_night_goes_on(o
     begun = up_to(observed, 90)
     predicted_px = decide(begun, WANTED).predicted_px
     decision = decide(begun, replace(WANTED, residual_px=0.95 * predicted_px))
-    assert decision.reason.startswith("what the model leaves between set-points")
+    assert decision.reason.startswith("what the model leaves")
     assert decision.chamber_degC == 38.0
 
 

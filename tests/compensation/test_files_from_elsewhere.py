@@ -222,7 +222,7 @@ def test_a_text_that_is_no_file_of_ours_is_refused(damage: Callable[[str], str],
     path.write_text(damage(path.read_text()))
     with little_memory(), pytest.raises(thermostand.SessionError, match=sentence) as raised:
         thermostand.load_model(path)
-    assert str(raised.value).startswith(f"{path}: not a drift model of this program")
+    assert str(raised.value).startswith(f"{path}: not a drift model")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a device without an end")
@@ -269,7 +269,7 @@ def pipe(tmp_path: Path) -> Path:
 
 def test_a_pipe_is_refused_and_stays_a_pipe(pipe: Path):
     for write in (check_writable, lambda path: write_whole(path, "text")):
-        with pytest.raises(SessionError, match=r"pipe: cannot be written \(it is not a regular file\)"):
+        with pytest.raises(SessionError, match=r"pipe: .*not a regular file"):
             write(pipe)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert list(pipe.parent.iterdir()) == [pipe]
@@ -299,7 +299,7 @@ def test_a_pipe_that_appears_during_the_work_is_refused_at_the_rename(tmp_path: 
             file.write("text")
             os.mkfifo(out)
 
-    with pytest.raises(SessionError, match="it is not a regular file"):
+    with pytest.raises(SessionError, match="not a regular file"):
         write()
     assert stat.S_ISFIFO(out.stat().st_mode)
     assert list(tmp_path.iterdir()) == [out]

@@ -117,14 +117,14 @@ def test_an_odd_marker_settles_every_roll(roll: float):
 
 def test_without_its_odd_marker_the_target_is_refused():
     candidates, _ = seen(Scene(rows=6, columns=6))
-    with pytest.raises(DetectionError, match="found 36 of 36 markers of square, but not the odd marker 1"):
+    with pytest.raises(DetectionError, match=r"36 of 36 .* square, .* odd marker 1"):
         identify(candidates, ODD)
 
 
 def test_a_missing_column_is_refused_and_the_frame_before_settles_it():
     column = tuple(range(1, 54, 9))
     candidates, truth = seen(Scene(), missing=column)
-    with pytest.raises(DetectionError, match=r"found 48 of 54 .* fit in more than one place of the grid"):
+    with pytest.raises(DetectionError, match=r"48 of 54 .* more than one place"):
         identify(candidates, PAPER)
     before = identify(seen(Scene())[0], PAPER).homography
     found = identify(candidates, PAPER, before)

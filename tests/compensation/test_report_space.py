@@ -110,7 +110,7 @@ def test_another_file_is_refused_with_a_sentence(
 ):
     path = written(validation, tmp_path)
     path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
-    with pytest.raises(SessionError, match=f"not a validation of this program.*{complaint}"):
+    with pytest.raises(SessionError, match=f"not a validation.*{complaint}"):
         load_validation(path)
 
 

@@ -95,14 +95,14 @@ def test_the_worse_camera_has_the_larger_discrepancy():
 def test_cameras_that_never_see_the_target_together_are_refused():
     views, board = drawn(1, 2, 14)
     views[0].centres_px[:7], views[1].centres_px[7:] = np.nan, np.nan
-    with pytest.raises(CalibrationError, match="camera 2 and the first one both see the target at 0 moments, 3 are"):
+    with pytest.raises(CalibrationError, match=r"camera 2 .* at 0 moments"):
         calibrate_rig([replace(one) for one in views], board)
 
 
 def test_a_camera_that_reads_the_target_from_its_other_end_is_refused():
     views, board = drawn(3, 2)
     views[1].centres_px[::2] = views[1].centres_px[::2, ::-1].copy()
-    with pytest.raises(CalibrationError, match=r"camera 2 turns by .* or the cameras read the target from different"):
+    with pytest.raises(CalibrationError, match=r"camera 2 turns by"):
         calibrate_rig(views, board)
 
 
@@ -125,4 +125,4 @@ def test_the_command_takes_pictures_of_the_same_names_and_says_where_the_second_
     assert np.all(np.abs(off) < 4 * np.array(right["translation_sigma_mm"]))
     assert (out / "right" / "opencv.yaml").exists()
     alone = CliRunner().invoke(app, ["calibrate-rig", folders[0], "--target", "paper-9x6", "--export", str(out)])
-    assert "a rig has two or more cameras" in alone.stderr
+    assert "two or more cameras" in alone.stderr

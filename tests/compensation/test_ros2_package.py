@@ -100,7 +100,6 @@ def test_what_is_unknown_is_said_and_camera_info_passes_unchanged(node: StubNode
     node.send("air_temperature", temperature(1.0, math.nan))
     status = node.published["diagnostics"][-1].status[0]
     assert (status.level, status.hardware_id) == (b"\2", "TS-0001")
-    assert "not followed for long enough" in status.message
 
 
 @pytest.mark.parametrize("jump_s", [3600.0, -5.0])
@@ -109,7 +108,7 @@ def test_a_gap_or_a_clock_that_steps_back_begins_again(node: StubNode, jump_s: f
     assert node.published["diagnostics"][-1].status[0].level == b"\0"
     node.send("camera_temperature", temperature(seconds + jump_s, 44.0))
     node.send("air_temperature", temperature(seconds + jump_s, 24.0))
-    assert "not followed for long enough" in node.published["diagnostics"][-1].status[0].message
+    assert node.published["diagnostics"][-1].status[0].level == b"\2"
 
 
 def test_a_camera_without_power_or_with_a_silent_sensor_is_followed(node: StubNode):

@@ -77,9 +77,9 @@ def test_the_exported_file_is_small():
 
 
 def test_a_file_that_is_no_runtime_model_is_refused():
-    with pytest.raises(ValueError, match="not a drift runtime model"):
+    with pytest.raises(ValueError, match="drift runtime model"):
         Drift({"format": "thermostand drift model"})
-    with pytest.raises(ValueError, match="of this version; export the model anew"):
+    with pytest.raises(ValueError, match="of this version"):
         Drift(runtime_model(thermal()) | {"version": 3})
 
 
@@ -99,5 +99,5 @@ def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_
     assert load_model(path).other is None
     for changed in ({"camera_serial": "TS-0002"}, {"other": single}):
         path.write_text(json.dumps(data | {"other": data["other"] | changed}))
-        with pytest.raises(SessionError, match=r"model\.json: not a drift model of this program \(other"):
+        with pytest.raises(SessionError, match=r"model\.json: .*\(other"):
             load_model(path)

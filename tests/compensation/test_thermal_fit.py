@@ -149,7 +149,7 @@ def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
     assert thermal.flags(point, unknown)[0] & Outside.HISTORY
     assert np.isnan(thermal.shift(point, unknown)).all()
     for ask in (thermal.correct, thermal.shift, thermal.covariance, thermal.flags):
-        with pytest.raises(ValueError, match="temperature alone does not say it"):
+        with pytest.raises(ValueError, match="temperature alone does not"):
             ask(point, 45.0)
 
 
@@ -192,7 +192,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
     data = json.loads((tmp_path / "model.json").read_text())
     assert (data["form"], data["schema_version"]) == ("thermal", 10)
     (tmp_path / "older.json").write_text(json.dumps({**data, "schema_version": 9}))
-    with pytest.raises(SessionError, match="schema_version: 9 is of an earlier, unreleased version"):
+    with pytest.raises(SessionError, match="schema_version: 9"):
         load_model(tmp_path / "older.json")
     (tmp_path / "model.json").write_text(json.dumps({**data, "reference_features": [0.0]}))
     with pytest.raises(SessionError, match="reference_features: shape"):
@@ -200,7 +200,7 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
 
 
 def test_what_the_thermal_form_needs_is_reported(night: Seen):
-    with pytest.raises(SessionError, match="no history of the air"):
+    with pytest.raises(SessionError, match="history of the air"):
         fit(without_histories(quadratic), form="thermal")
     with pytest.raises(ConfigError, match="has no degree"):
         fit(night[0], degree=3, form="thermal")
@@ -217,8 +217,8 @@ def test_a_night_that_only_one_form_can_be_fitted_to_has_that_form_and_says_what
     model = fit(observed, say=said.append)
     assert (model.form, model.other) == ("thermal", None)
     (sentence,) = said
-    assert sentence.startswith("the paper form could not be fitted: a fit needs frames at 3 chamber temperatures")
-    with pytest.raises(SessionError, match="a fit needs frames at 3 chamber temperatures"):
+    assert sentence.startswith("the paper form")
+    with pytest.raises(SessionError, match="at 3 chamber temperatures"):
         fit(observed, form="paper")
 
 

@@ -235,9 +235,9 @@ def test_pinhole_and_rays_agree(laboratory: Laboratory, file: CameraFile, model:
 def test_camera_model_and_session_must_belong_together(laboratory: Laboratory, file: CameraFile, model: PaperModel):
     observed, _ = validation_session(laboratory, TRUTH, temperatures_degC=(24.0, 43.0))
     check_same(observed, file, model)
-    with pytest.raises(SessionError, match="the drift model is of camera TS-9"):
+    with pytest.raises(SessionError, match="is of camera TS-9"):
         check_same(observed, file, replace(model, facts=replace(model.facts, camera_serial="TS-9")))
-    with pytest.raises(SessionError, match="the camera file is of camera TS-0001, target other"):
+    with pytest.raises(SessionError, match="TS-0001, target other"):
         check_same(observed, file.model_copy(update={"target_name": "other"}), model)
 
 

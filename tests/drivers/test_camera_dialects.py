@@ -178,7 +178,7 @@ async def test_a_selector_that_the_camera_refuses_costs_the_temperature_and_not_
             (reading,) = await camera.read()
             await camera.grab()
     assert reading.quality is Quality.BAD
-    assert "where its temperature is cannot be read ([DeviceTemperatureSelector]" in reading.reason
+    assert "cannot be read ([DeviceTemperatureSelector]" in reading.reason
 
 
 @pytest.mark.nightly  # the three seconds for which Aravis asks again

@@ -125,7 +125,7 @@ async def test_one_that_restarted_running_at_its_old_set_point_is_reported_and_l
         for _ in range(2):
             found = await bench.read()
         assert (found["running"].value, found["sp"].value) == (1, 55)
-        assert found["fault"].reason == "set point changed at the unit, from 30 to 55 degC"
+        assert found["fault"].reason.endswith("from 30 to 55 degC")
         assert bench.fake.setpoint_degC == 55
 
 
@@ -158,14 +158,14 @@ async def test_humidity_that_only_the_panel_can_switch_off_keeps_it_from_startin
     async with bench_of("cts", "tcp", tmp_path) as bench:
         bench.fake.humidity_on = True
         await bench.driver.open()
-        with pytest.raises(Refused, match="can only be switched off at the panel"):
+        with pytest.raises(Refused, match="at the panel"):
             await bench.driver.run()
         assert not bench.fake.running
 
 
 async def test_a_unit_of_another_identity_is_not_used_also_after_a_loss(tmp_path: Path):
     async with bench_of("espec", "tcp", tmp_path, identity="T,T,S9") as bench:
-        with pytest.raises(DeviceFault, match=r"it says that it is 'T,T,S2,160.0', not 'T,T,S9'; not used"):
+        with pytest.raises(DeviceFault, match=r"'T,T,S2,160.0', not 'T,T,S9'"):
             await bench.driver.open()
         with pytest.raises(DeviceFault, match="not used"):
             await bench.driver.set_temperature(30.0)

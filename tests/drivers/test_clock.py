@@ -151,7 +151,7 @@ def test_a_thread_waits_for_an_instant_but_never_for_virtual_time():
     block_until(clock, due_ns)
     assert clock.now_ns() >= due_ns
     block_until(VirtualClock(5), 5)
-    with pytest.raises(ValueError, match="virtual time does not pass"):
+    with pytest.raises(ValueError, match="does not pass"):
         block_until(VirtualClock(5), 6)
 
 

@@ -104,7 +104,7 @@ async def test_left_alone_it_goes_to_its_safe_value_in_its_watchdogs_time():
         await bench.wait(3.5)
         assert bench.heater_W() == 0.0
         assert bench.fake.output_mA() == 4.0
-        with pytest.raises(DeviceFault, match=r"its host watchdog has tripped \(5\.5 s after .* gives 4\.00 mA until"):
+        with pytest.raises(DeviceFault, match=r"watchdog has tripped \(5\.5 s after .* 4\.00 mA"):
             await module.give(100)
         with pytest.raises(DeviceFault, match="has tripped"):  # not cleared by itself
             await module.give(100)
@@ -146,7 +146,8 @@ async def test_what_it_gave_last_is_not_shown_as_fresh_when_the_law_cannot_ask_i
         assert (output.quality, output.time_ns) == (Quality.GOOD, bench.clock.now_ns())
         await bench.wait(6.0)
         (output, _) = await module.read()
-        assert (output.quality, output.reason) == (Quality.STALE, "the law has not asked it for 6 s")
+        assert output.quality == Quality.STALE
+        assert "6 s" in output.reason
 
 
 UNSAFE: list[tuple[Callable[[FakeHeatModule], object], str]] = [
@@ -190,7 +191,7 @@ async def test_a_watchdog_that_wants_another_protocol_is_reported():
     bench = Bench()
     bench.fake.refreshed_by = "nothing"
     async with driven(bench) as module:
-        with pytest.raises(DeviceFault, match=r"trips though it is written to; does it want the broadcast"):
+        with pytest.raises(DeviceFault, match=r"trips though it is"):
             await module.test_dead_man()
 
 
@@ -201,7 +202,7 @@ async def test_a_watchdog_that_does_not_trip_is_reported():
     bench = Bench()
     bench.fake = Deaf(bench.plant, bench.clock, UNIT, channel=1)
     async with driven(bench) as module:
-        with pytest.raises(DeviceFault, match=r"does not trip after 7\.5 s without us; it would heat on"):
+        with pytest.raises(DeviceFault, match=r"does not trip after 7\.5 s"):
             await module.test_dead_man()
 
 
@@ -216,7 +217,7 @@ async def test_what_another_master_writes_is_found_and_set_to_zero():
         await module.arm()
         await module.give(50)
         bench.fake.write_mA(20.0)
-        with pytest.raises(DeviceFault, match=r"gave 20\.00 mA where it was left at 12\.00 mA"):
+        with pytest.raises(DeviceFault, match=r"gave 20\.00 mA .* 12\.00 mA"):
             await module.give(50)
         assert bench.fake.output_mA() == 4.0
 
@@ -315,7 +316,7 @@ def test_its_registers_are_those_of_the_fact_sheet_in_driver_and_fake_and_none_p
 def test_a_module_without_a_watchdog_that_can_be_read_is_refused():
     text = packaged("registers", "icpdas-m7024").read_text().replace("watchdog_s:", "other_s:")
     bus = Bus("bus", BusSettings(address="tcp:127.0.0.1:1"), VirtualClock(0))
-    with pytest.raises(ConfigError, match="has no watchdog_s, without which nothing ends the heat"):
+    with pytest.raises(ConfigError, match="has no watchdog_s"):
         HeatModule(ModbusUnit("heat_module", bus, parse_document(text, RegisterMap, "map")), SETTINGS, VirtualClock(0))
 
 
@@ -353,7 +354,7 @@ async def test_an_output_with_a_slew_rate_is_found_at_its_first_heat_and_gives_n
         await module.open()
         await module.arm()
         bench.fake.slew_mA_per_s = 0.125
-        with pytest.raises(DeviceFault, match=r"left at 12\.00 mA; .* or is its slew rate not immediate"):
+        with pytest.raises(DeviceFault, match=r"left at 12\.00 mA; .* slew rate"):
             await heating(bench, module, 50.0)
         assert module.uncontrolled
         await bench.wait(10.0)

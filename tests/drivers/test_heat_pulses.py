@@ -109,7 +109,7 @@ async def test_a_relay_that_is_not_as_it_was_left_is_switched_off_and_reported(p
 
 
 def test_pulses_and_pauses_that_fill_the_cycle_are_refused():
-    with pytest.raises(ValueError, match="more than half of cycle_s"):
+    with pytest.raises(ValueError, match="half of cycle_s"):
         PulsesSettings(cycle_s=10, min_on_s=3, min_off_s=3)
 
 

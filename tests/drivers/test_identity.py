@@ -117,5 +117,5 @@ def test_another_device_is_recognised_by_what_both_state(found: Identity, is_sam
     if is_same:
         assert same_device("camera", found, A) == found
     else:
-        with pytest.raises(DeviceFault, match=r"exchanged: .* answers where Make M, serial number 1, version 2\.00"):
+        with pytest.raises(DeviceFault, match=r"exchanged: .* Make M, serial number 1, version 2\.00"):
             same_device("camera", found, A)

@@ -73,7 +73,7 @@ async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goe
     waiting = asyncio.create_task(lane.call(int))
     await asyncio.sleep(0)
     lane.abandon()
-    with pytest.raises(TimeoutError, match="test has not answered; no longer waiting for it"):
+    with pytest.raises(TimeoutError, match="test has not answered"):
         await waiting
     with pytest.raises(TimeoutError):
         await lane.call(int)
@@ -105,14 +105,14 @@ async def test_a_thread_that_memory_does_not_suffice_for_fails_its_calls_and_the
     monkeypatch.setattr("thermostand.foundation.calls._BEGIN_LIMIT_S", 0.01)
     monkeypatch.setattr("_thread.start_new_thread", lambda function, args: 0)  # it ends before its first step
     died = Lane("disk", WallClock())
-    with pytest.raises(MemoryError, match="no memory for the thread of disk"):
+    with pytest.raises(MemoryError, match="the thread of disk"):
         await died.call(int)
 
     def refuse(function: object, args: object) -> int:
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr("_thread.start_new_thread", refuse)
-    with pytest.raises(MemoryError, match="no thread for bus: can't start"):
+    with pytest.raises(MemoryError, match="no thread for bus"):
         await Lane("bus", WallClock()).call(int)
     monkeypatch.undo()
     assert await died.call(int) == 0
@@ -146,7 +146,7 @@ def test_what_cannot_be_handed_over_is_answered_and_the_line_lives(
     serving = threading.Thread(target=answer_all, args=(theirs, {}), daemon=True)
     serving.start()
     line = Line(ours, "the process has ended")
-    with pytest.raises(OSError, match=f"a call to another process failed .{why}"):
+    with pytest.raises(OSError, match=f"another process failed .{why}"):
         line.run(function, argument)
     assert line.run(len, "abc") == 3
     line.close()

@@ -89,7 +89,7 @@ def test_a_second_opener_of_a_serial_port_learns_that_it_is_taken(tmp_path: Path
     wire = PtyWire(tmp_path / "port", Echo(), LinkFaults())
     address = f"serial:{tmp_path / 'port'}"
     with closing(wire), closing(open_link("stage", address, LINE)) as first:
-        with pytest.raises(Unreachable, match=rf"^other: cannot open {tmp_path}/port: another program has it open$"):
+        with pytest.raises(Unreachable, match=rf"^other: cannot open {tmp_path}/port: another program"):
             open_link("other", address, LINE)
         first.write(b"mine")
         assert read_all(first, 4) == b"mine"
@@ -107,7 +107,7 @@ def test_a_simulated_port_is_named_as_the_stands_file_does(tmp_path: Path, state
 
 
 def test_a_missing_port_is_reported_as_such(tmp_path: Path) -> None:
-    with pytest.raises(Unreachable, match=rf"^stage: cannot open {tmp_path}/none: No such file or directory$"):
+    with pytest.raises(Unreachable, match=rf"^stage: cannot open {tmp_path}/none: No such file"):
         open_link("stage", f"serial:{tmp_path / 'none'}", LINE)
 
 

@@ -194,7 +194,7 @@ async def test_a_set_point_that_is_not_the_one_that_acts_stops_what_was_started(
         assert (found.objections, bool(found.known_by), bool(found.not_told)) == ((), True, True)
         setattr(bench.fake, name, value)
         bench.wait(5.0)
-        with pytest.raises(DeviceFault, match="its set-point is not in force: "):
+        with pytest.raises(DeviceFault, match="not in force: "):
             await regulator.run()
         bench.wait(1.0)
         assert bench.plant.heater_on_fraction == 0
@@ -216,7 +216,8 @@ async def test_a_map_that_does_not_say_what_is_in_force_is_known_as_such():
     async with driven(Bench("watlow-f4t"), map_of("watlow-f4t", without)) as regulator:
         await regulator.open()
         found = await regulator.in_force()
-        assert (found.known_by, found.not_told) == ("", "its register map has no in_force")
+        assert found.known_by == ""
+        assert "in_force" in found.not_told
 
 
 async def test_eurotherm_sensor_break_makes_the_pv_bad():
@@ -234,7 +235,7 @@ async def test_a_unit_that_speaks_degrees_fahrenheit_is_refused():
     assert isinstance(bench.fake, FakeEzZone)
     bench.fake.comms_unit = 30
     async with driven(bench, map_of("watlow-ez-zone")) as regulator:
-        with pytest.raises(DeviceFault, match="comms_unit is 30 where the register map expects 15"):
+        with pytest.raises(DeviceFault, match=r"comms_unit is 30 .* 15"):
             await regulator.open()
 
 
@@ -294,6 +295,6 @@ async def test_what_confirms_a_command_has_to_be_read_at_each_poll(tmp_path: Pat
     data = yaml.safe_load(packaged("registers", "watlow-f4t").read_text())
     del data["points"]["mode"]["poll"]
     bench = Bench("watlow-f4t")
-    with pytest.raises(ConfigError, match="mode, which confirms run, needs poll: fast"):
+    with pytest.raises(ConfigError, match=r"mode, .* needs poll: fast"):
         async with driven(bench, parse_document(yaml.safe_dump(data), RegisterMap, "f4t")):
             pass

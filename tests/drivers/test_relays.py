@@ -108,7 +108,7 @@ async def test_a_time_the_board_cannot_count_is_a_mistake(relays: Relays, board:
 
 async def test_a_relay_that_does_not_move_is_an_error(relays: Relays, board: type[BoardWrite]) -> None:
     board.stuck = {0}
-    with pytest.raises(Refused, match="relays: heater_enable on was acknowledged but reads back otherwise"):
+    with pytest.raises(Refused, match="relays: heater_enable on was acknowledged"):
         await relays.switch("heater_enable", True)
     with pytest.raises(Refused):
         await relays.hold_on("heater_enable", 15.0)
@@ -166,6 +166,6 @@ def test_a_board_without_a_timed_on_is_refused_for_heat_and_cold_and_may_feed_a_
     points = {name: point.model_copy(update={"pulse": None}) for name, point in MAP.points.items()}
     plain = MAP.model_copy(update={"points": points})
     for channel in ("heater_enable", "compressor", "heat"):
-        with pytest.raises(ConfigError, match=rf"relays.{channel}: .* knows no timed-on of relay_0, without which"):
+        with pytest.raises(ConfigError, match=rf"relays.{channel}: .* no timed-on of relay_0"):
             Relays("relays", bus, plain, {channel: 0})
     Relays("relays", bus, plain, {"camera_power": 0})

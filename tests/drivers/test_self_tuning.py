@@ -55,7 +55,7 @@ async def test_a_set_point_that_is_not_the_internal_one_is_a_fault_and_is_stoppe
         setattr(fake, name, value)
         await regulator.stop()
         await regulator.set_temperature(40.0)
-        with pytest.raises(DeviceFault, match="its set-point is not in force: another set-point acts"):
+        with pytest.raises(DeviceFault, match="another set-point acts"):
             await regulator.run()
         clock.follow(clock.now_ns() + seconds_ns(60))
         found = {each.channel: each for each in await regulator.read()}
@@ -80,7 +80,7 @@ async def test_a_real_self_tuning_takes_no_set_point_ends_by_itself_and_holds_be
         before = [word(address) for address in CONSTANTS]
         fake.press_autotune(on=True)
         looks = [await pass_s(5)]
-        with pytest.raises(Occupied, match="autotuning is active; no set point was sent"):
+        with pytest.raises(Occupied, match="autotuning is active"):
             await regulator.set_temperature(40.0)
         while looks[-1]["fault"] == "autotune" and len(looks) < 720:
             looks.append(await pass_s(5))

@@ -153,7 +153,7 @@ async def test_values_are_stale_while_the_fault_bits_cannot_be_read(thermometers
 
 async def test_another_type_code_is_refused(thermometers: Thermometers, module: Module) -> None:
     module.types[3] = 0x2E
-    with pytest.raises(DeviceFault, match="thermometers: type_code_3 is 46 where the register map expects 32"):
+    with pytest.raises(DeviceFault, match=r"thermometers: type_code_3 is 46 .* 32"):
         await thermometers.open()
     with pytest.raises(DeviceFault, match="type_code_3"):
         await thermometers.read()

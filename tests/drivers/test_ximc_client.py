@@ -177,7 +177,7 @@ def test_a_command_with_a_damaged_acknowledgement_is_reported_and_never_repeated
 
 def test_after_two_repeats_a_query_is_given_up(client: XimcClient, controller: Controller) -> None:
     controller.faults.extend([wrong_crc] * 3)
-    with pytest.raises(GarbledReply, match=r"the answer to gpos was 'gpos' \(CRC\)"):
+    with pytest.raises(GarbledReply, match=r"'gpos' \(CRC\)"):
         position(client)
     assert len(controller.requests) == 3
     assert position(client) == 4
@@ -218,7 +218,7 @@ def test_a_late_acknowledgement_is_never_credited_to_the_next_command(
     client: XimcClient, controller: Controller
 ) -> None:
     controller.faults.extend([controller.late, says(b"errd")])
-    with pytest.raises(Unreachable, match=r"no answer to move within 0\.25 s"):
+    with pytest.raises(Unreachable, match=r"move within 0\.25 s"):
         client.command("move", MOVE_PAYLOAD)
     with pytest.raises(GarbledReply, match="received move damaged"):
         client.command("move", MOVE_PAYLOAD)
@@ -291,7 +291,7 @@ def test_silence_is_unreachable_in_bounded_time_and_nothing_is_asked_twice_over_
 ) -> None:
     faults.silent = True
     begun_s = time.monotonic()
-    with pytest.raises(Unreachable, match=r"^linear: the controller does not answer"):
+    with pytest.raises(Unreachable, match=r"^linear: "):
         position(hurried)
     assert time.monotonic() - begun_s < 10.0  # five time-outs of 0.05 s, on a busy machine
     assert len(controller.requests) == 1

@@ -17,7 +17,8 @@ def test_many_looks_show_a_twentieth_of_a_pixel_and_few_less() -> None:
     assert many == Looks(14, 0.05)
     assert some == Looks(8, 0.3)
     assert few == Looks(5, None)
-    assert str(many) == "14 looks at the drift: a step of the image from 50 mpx on shows"
+    assert str(many).startswith("14 looks")
+    assert "50 mpx" in str(many)
     assert "too few to tell" in str(few)
 
 

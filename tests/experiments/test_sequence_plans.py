@@ -88,9 +88,8 @@ def test_the_warm_up_takes_3600_frames_every_half_second_twice_the_second_time_r
     assert [(step.frames, step.interval_s, step.exposure_s) for step in captures(steps, Role.WARM_UP)] == [
         (3600, 0.5, 0.1)
     ] * 2
-    assert [step.text for step in steps if isinstance(step, Prompt)] == [
-        "roll the camera about its optical axis, from 0 to 20 deg"
-    ]
+    (prompt,) = [step.text for step in steps if isinstance(step, Prompt)]
+    assert "from 0 to 20 deg" in prompt
 
 
 def test_the_validation_visits_v0_to_v3_and_v0_again_at_12_temperatures():

@@ -61,7 +61,7 @@ def test_a_session_that_grew_since_is_not_archived_any_more_and_its_copy_is_not_
     with (session / "journal.jsonl").open("ab") as file:
         file.write(b"00000000 {}\n")
     assert look_at(session).archived == ""
-    with pytest.raises(SessionError, match="is there already and is another session, or an older state"):
+    with pytest.raises(SessionError, match="is there already"):
         archive(look_at(session), nas, "eva", 6)
 
 
@@ -112,13 +112,13 @@ def test_what_is_recorded_unfinished_or_may_be_resumed_is_not_copied(session: Pa
         with pytest.raises(SessionError, match=f"its run is {run} and may be resumed"):
             archive(replace(entry, run=run), nas, "eva", 5)
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0009.mcap.part")
-    assert "is being recorded, or was never finished" in unfit(look_at(session))
+    assert "was never finished" in unfit(look_at(session))
     assert not nas.exists()
 
 
 def test_a_full_disk_is_reported_before_anything_is_copied(session: Path, nas: Path, monkeypatch):
     monkeypatch.setattr(module.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 9, 1))
-    with pytest.raises(SessionError, match=r"has 0.0 GB free, and night needs 0.1 GB"):
+    with pytest.raises(SessionError, match=r"0.0 GB free, .* needs 0.1 GB"):
         archive(look_at(session), nas, "eva", 5)
 
 
@@ -131,7 +131,7 @@ def test_the_rule_says_what_may_be_deleted(session: Path, nas: Path):
     assert [rule.applies(entry, end_ns + days * DAY_NS) for days in (0, 29, 30, 31)] == [False, False, True, True]
     assert not rule.applies(replace(entry, files="damaged"), end_ns + 40 * DAY_NS)
     assert not rule.applies(replace(entry, tags=("keep",)), end_ns + 40 * DAY_NS)
-    assert str(rule).startswith("deleted are sound sessions that ended at least 30 days ago, have a copy")
+    assert str(rule).startswith("deleted are sound sessions")
 
 
 def test_what_has_a_copy_is_deleted(session: Path, nas: Path):
@@ -177,6 +177,6 @@ def test_a_session_that_a_daemon_has_open_is_not_deleted(session: Path, nas: Pat
     entry = look_at(session)
     with (session / "journal.jsonl").open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        with pytest.raises(SessionError, match="a daemon has this session open; it is kept"):
+        with pytest.raises(SessionError, match="it is kept"):
             delete(entry)
     assert session.is_dir()

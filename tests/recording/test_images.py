@@ -134,7 +134,7 @@ def test_windows_outside_the_image_are_a_programming_mistake(bad):
 @pytest.mark.parametrize("bad", [*(np.array(bad, "<i4").tobytes() for bad in BAD_WINDOWS), b"123"])
 def test_recorded_windows_that_cannot_be_right_are_a_session_error(bad):
     meta = replace(decode_frame_meta(described(frame(SMALL, WINDOWS))), windows=bad)
-    with pytest.raises(SessionError, match="windows of a recorded image cannot be right"):
+    with pytest.raises(SessionError, match="windows of a recorded"):
         windows_of(meta)
 
 

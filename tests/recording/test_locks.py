@@ -48,7 +48,7 @@ def test_who_was_seen_once_is_named_when_the_list_leaves_it_out(
     looks = iter(listed)
     monkeypatch.setattr(locks, "_LEFT_WITHIN_S", 0.2)
     monkeypatch.setattr(locks, "holder", lambda fd: left if next(looks, False) else 0)
-    with pytest.raises(BlockingIOError, match=f"process {left} still waits for the disk"):
+    with pytest.raises(BlockingIOError, match=f"process {left} still waits"):
         locks.lock(file)
 
 

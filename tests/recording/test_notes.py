@@ -57,7 +57,7 @@ def test_a_note_has_a_text_of_a_page_at_most(tmp_path: Path, text: str):
 
 @pytest.mark.parametrize("tag", ["", "two words", "-x", "a,b", "x" * 41, "a\n", "../x"])
 def test_a_tag_is_a_word(tmp_path: Path, tag: str):
-    with pytest.raises(ConfigError, match="a tag is one word"):
+    with pytest.raises(ConfigError, match="one word"):
         add_tags(tmp_path, [tag], "eva", 1)
     assert not (tmp_path / NOTES_NAME).exists()
 
@@ -74,7 +74,7 @@ def test_links_and_pipes_are_no_notes(tmp_path: Path):
     (tmp_path / NOTES_NAME).rmdir()
     os.mkfifo(tmp_path / NOTES_NAME)
     assert read_notes(tmp_path) == SessionNotes()
-    with pytest.raises(SessionError, match="is no file of notes"):
+    with pytest.raises(SessionError, match="file of notes"):
         add_note(tmp_path, "x", "eva", 1)
 
 

@@ -94,7 +94,7 @@ async def test_the_overview_has_frames_temperatures_and_events(session):
     assert found.gaps == found.scanned.findings == ()
     assert [event.kind for event in found.events] == ["device_lost", "run.end"]
     assert found.ending is not None
-    assert found.ending.text == "aborted: stopped by the operator"
+    assert found.ending.text.partition(":")[0] == "aborted"
 
 
 async def test_a_damaged_segment_is_reported_and_the_others_are_read(session):
@@ -121,10 +121,9 @@ async def test_a_session_without_telemetry_is_not_complete(session):
     for path in (session / "telemetry").iterdir():
         path.rename(path.with_name(f"{path.name}.damaged"))
     kept = len(list((session / "telemetry").iterdir()))
-    assert scan(session).state_text == (
-        "damaged: telemetry/0000.mcap.damaged: is an original that a salvage kept because it could not recover all of "
-        f"it and {kept - 1} more"
-    )
+    said = scan(session).state_text
+    assert said.startswith("damaged: telemetry/0000.mcap.damaged: ")
+    assert said.endswith(f" and {kept - 1} more")
     shutil.rmtree(session / "telemetry")
     assert scan(session).state_text == "incomplete: telemetry: is missing"
     assert overview(session).frames.count == 5
@@ -145,9 +144,9 @@ async def test_frames_that_the_recorder_lost_are_counted_apart_from_those_that_n
 async def test_what_a_salvage_kept_and_what_is_no_segment(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
     (session / "frames" / "notes.txt").write_text("a cloudy night")
-    assert scan(session).state_text == (
-        "damaged: frames/0000.2.mcap.damaged: is an original that a salvage kept because it could not recover all of it"
-    )
+    seen = scan(session)
+    assert seen.state_text.startswith("damaged: frames/0000.2.mcap.damaged: ")
+    assert [finding.where for finding in seen.findings] == ["frames/0000.2.mcap.damaged"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
@@ -216,7 +215,7 @@ def test_an_instant_is_a_time_in_utc_or_counts_from_the_beginning(text, after_be
 
 @pytest.mark.parametrize("text", ["", "+", "noon", "+5x", "12:00", "+-5", "2026-13-01"])
 def test_what_is_no_time_says_what_would_be(text):
-    with pytest.raises(ConfigError, match=r"expected a time such as 2026-01-01T18:30:00, \+1h30m or step:12"):
+    with pytest.raises(ConfigError, match=r"2026-01-01T18:30:00, \+1h30m or step:12"):
         parse_instant(text, 0)
 
 
@@ -224,7 +223,7 @@ def test_what_is_no_time_says_what_would_be(text):
     "text", ["+99999999h", f"+{'9' * 400}h", "1969-12-31T23:59:59", "0001-01-01T00:00+14:00", "9999-12-31T23:00-14:00"]
 )
 def test_a_time_that_no_recording_has_is_refused(text):
-    with pytest.raises(ConfigError, match=r": is not between the years 1970 and 9999$"):
+    with pytest.raises(ConfigError, match=r"years 1970 and 9999$"):
         parse_instant(text, START_NS)
 
 

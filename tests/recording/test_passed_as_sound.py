@@ -65,7 +65,7 @@ def test_a_segment_that_has_only_another_name_is_missing(session, name):
 def test_a_text_that_was_edited_in_one_segment_is_damage(session):
     rewritten(session / FRAMES / "0001.mcap", attachments={"config.yaml": b"camera: {gain_dB: 9.0}\n"})
     assert words(session) is Files.DAMAGED
-    with pytest.raises(SessionError, match=r"frames/0001\.mcap: has other texts attached than"):
+    with pytest.raises(SessionError, match=r"frames/0001\.mcap: has other texts"):
         list(Session.open(session).frames())
 
 
@@ -81,7 +81,7 @@ def test_a_text_that_was_edited_or_removed_everywhere_is_not_what_the_run_began_
     else:
         everywhere(session, attachments={"config.yaml": text})
     assert words(session) is Files.DAMAGED
-    with pytest.raises(SessionError, match="is not attached as the run began with it"):
+    with pytest.raises(SessionError, match="is not attached"):
         open_whole(session)
 
 
@@ -96,8 +96,8 @@ async def test_complete_without_a_planned_capture_is_incomplete(tmp_path):
     directory = await record_run(tmp_path / "s", items=without_step)
     write_journal(directory, *(entry for entry in entries() if entry.get("step_id") != "capture-7"))
     assert words(directory) is Files.INCOMPLETE
-    assert any("1 frame of the plan: missing" in str(finding) for finding in verify(directory).findings)
-    with pytest.raises(SessionError, match=f"{SECONDS - 1} of the {SECONDS} frames of the plan are there"):
+    assert any("of the plan: missing" in str(finding) for finding in verify(directory).findings)
+    with pytest.raises(SessionError, match=f"{SECONDS - 1} of the {SECONDS} frames"):
         open_whole(directory)
 
 

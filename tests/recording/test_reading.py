@@ -372,7 +372,7 @@ def test_wrong_content_under_right_crcs_is_reported(tmp_path, change, sentence):
 def test_a_step_nested_deeper_than_python_goes_is_reported(tmp_path):
     step = messages.CLASSES[messages.STEP](state="done", parameters_json="[" * 200_000).SerializeToString()
     write(tmp_path / TELEMETRY, telemetry_topics({}), [[MessageRecord(messages.STEP, START_NS, step)]])
-    with pytest.raises(SessionError, match="a recorded step cannot be read"):
+    with pytest.raises(SessionError, match="a recorded step"):
         Session.open(tmp_path).steps()
 
 
@@ -386,7 +386,7 @@ def test_a_chunk_in_the_place_of_another_is_refused(tmp_path):
     assert lengths[0] == lengths[1], "else this is no test"
     chunk = data[heads[0] : heads[0] + 9 + lengths[0]]
     path.write_bytes(data[: heads[1]] + chunk + data[heads[1] + len(chunk) :])
-    with pytest.raises(SessionError, match="the index points to another chunk"):
+    with pytest.raises(SessionError, match="points to another chunk"):
         Session.open(tmp_path).readings("thermometers.air")
 
 
@@ -395,7 +395,7 @@ def test_metadata_that_changed_is_seen_even_in_a_session_of_one_segment(tmp_path
     path = tmp_path / TELEMETRY / "0000.mcap"
     data = path.read_bytes()
     path.write_bytes(data.replace(b"night-1", b"night-7"))
-    with pytest.raises(SessionError, match="metadata do not fit their CRC"):
+    with pytest.raises(SessionError, match=r"metadata .* CRC"):
         Session.open(tmp_path)
 
 

@@ -132,7 +132,7 @@ async def test_a_second_run_continues_the_session(tmp_path):
 def test_mistakes_in_the_wiring_are_value_errors(tmp_path):
     hub, clock = Hub(), VirtualClock(START_NS)
     twice = RecordedDevice("toaster", (Channel("crust", "degC"), Channel("crust", "degC")))
-    with pytest.raises(ValueError, match="kitchen declares one of its channels twice"):
+    with pytest.raises(ValueError, match="kitchen declares"):
         Recorder(tmp_path, INFO, {}, {"kitchen": twice}, hub, clock)
     Recorder(tmp_path / "s", INFO, {}, DEVICES, hub, clock).start()
     with pytest.raises(ValueError, match="humidity is not among"):
@@ -141,7 +141,7 @@ def test_mistakes_in_the_wiring_are_value_errors(tmp_path):
 
 def test_a_place_where_nothing_can_be_written_is_a_session_error(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(SessionError, match="no session can be recorded here"):
+    with pytest.raises(SessionError, match="no session can"):
         Recorder(tmp_path / "file", INFO, {}, DEVICES, Hub(), VirtualClock(START_NS)).start()
 
 

@@ -141,7 +141,7 @@ def test_a_clock_of_another_speed_reads_and_waits_in_session_time():
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_speed_that_is_none_is_a_programming_mistake(speed):
-    with pytest.raises(ValueError, match="a speed is a positive number"):
+    with pytest.raises(ValueError, match="a positive number"):
         ReplayClock(START_NS, speed)
 
 
@@ -173,7 +173,7 @@ async def test_a_session_tells_which_devices_it_recorded(tmp_path):
 
 async def test_a_session_without_items_cannot_be_replayed(tmp_path):
     await record(tmp_path / "s", 0)
-    with pytest.raises(SessionError, match="holds nothing that could be replayed"):
+    with pytest.raises(SessionError, match="could be replayed"):
         await replay_and_record(Session.open(tmp_path / "s"), tmp_path / "r", None)
 
 
@@ -196,6 +196,6 @@ async def test_a_copy_that_would_lack_frames_does_not_appear(tmp_path):
     await record(tmp_path / "s", items=items, encoding="raw")
     with tmpfs(tmp_path / "disk", "24m") as disk:
         (disk / "ballast").write_bytes(bytes(24 * 2**20 - 1_600_000))
-        with pytest.raises(SessionError, match=r"r: \d frames could not be written; is the disk full or too slow"):
+        with pytest.raises(SessionError, match=r"r: \d frames could not"):
             await replay_and_record(Session.open(tmp_path / "s"), disk / "r", None)
         assert [path.name for path in disk.iterdir()] == ["ballast"]

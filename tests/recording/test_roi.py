@@ -117,7 +117,8 @@ def test_a_search_that_failed_leaves_the_frames_whole_and_is_reported_and_repeat
     keep, reported = MarkerWindows(fail), []
     keep.tell = reported.append
     assert whole(keep, [frame(second) for second in (0, 1, 59)]) == [True] * 3
-    assert reported == ["frames are recorded whole: the search for markers failed (RuntimeError: no luck)"]
+    (reason,) = reported
+    assert "(RuntimeError: no luck)" in reason
     keep(frame(60))
     assert len(reported) == 2
 

@@ -158,9 +158,8 @@ async def test_a_missing_segment_is_named(session, series):
 
 async def test_frames_that_went_with_a_segment_are_counted(session):
     (session / "frames" / "0001.mcap").unlink()
-    assert errors(session)[1] == (
-        "error: 4 frames of capture, 2026-01-01 18:00:00 to 2026-01-01 18:00:11 UTC: "
-        "missing, though their steps are done"
+    assert errors(session)[1].startswith(
+        "error: 4 frames of capture, 2026-01-01 18:00:00 to 2026-01-01 18:00:11 UTC: missing"
     )
 
 
@@ -177,15 +176,16 @@ async def test_frames_in_a_damaged_chunk_are_not_called_missing_as_well(session)
 async def test_a_cut_segment_is_damaged(session):
     path = session / "telemetry" / "0001.mcap"
     path.write_bytes(path.read_bytes()[:-30])
-    assert errors(session) == ["error: telemetry/0001.mcap: is damaged: it ends in the middle"]
+    (text,) = errors(session)
+    assert text.startswith("error: telemetry/0001.mcap: is damaged: ")
 
 
 async def test_what_a_recorder_or_a_salvage_left_is_reported(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0007.mcap.part")
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.mcap.damaged")
     found = errors(session)
-    assert "error: frames/0007.mcap.part: is not finished; `stand session salvage` recovers what is in it" in found
-    assert any(text.startswith("error: frames/0000.mcap.damaged: is an original that a salvage kept") for text in found)
+    assert any(text.startswith("error: frames/0007.mcap.part: is not finished") for text in found)
+    assert any(text.startswith("error: frames/0000.mcap.damaged: is an original") for text in found)
 
 
 def with_a_damaged_index(path):
@@ -201,10 +201,7 @@ async def test_an_original_from_which_everything_was_recovered_is_a_note(session
     assert errors(session)
     salvage_session(session)
     assert errors(session) == []
-    assert notes(session)[0] == (
-        f"note: {name}.damaged: a salvage recovered every message and kept the original because it was finished and "
-        "damaged; remove it when it is not needed"
-    )
+    assert notes(session)[0].startswith(f"note: {name}.damaged: a salvage recovered")
 
 
 async def test_an_original_from_which_something_is_lost_stays_an_error(session):
@@ -216,9 +213,9 @@ async def test_an_original_from_which_something_is_lost_stays_an_error(session):
     with_a_damaged_index(path)
     salvage_session(session)  # it recovers all that the first one did
     kept, frame_lost = errors(session)
-    assert kept.startswith("error: frames/0001.mcap.damaged: is an original that a salvage kept")
+    assert kept.startswith("error: frames/0001.mcap.damaged: is an original")
     assert frame_lost.startswith("error: 1 frame of capture")
-    assert notes(session)[0].startswith("note: frames/0001.2.mcap.damaged: a salvage recovered every message")
+    assert notes(session)[0].startswith("note: frames/0001.2.mcap.damaged: a salvage recovered")
 
 
 async def test_an_original_that_was_cut_short_stays_an_error(session):
@@ -236,7 +233,8 @@ async def test_a_segment_that_is_being_recorded_is_no_error(session):
     with part.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert errors(session) == []
-        assert notes(session) == [f"note: frames/{part.name}: is being recorded now and was not read"]
+        (note,) = notes(session)
+        assert note.startswith(f"note: frames/{part.name}: is being recorded")
         assert [str(entry.state) for entry in inventory(session)].count("recording") == 1
 
 
@@ -246,13 +244,12 @@ def as_left(path):
 
 
 def not_finished(parts):
-    text = "is not finished; `stand session salvage` recovers what is in it"
-    return [f"error: {path.parent.name}/{path.name}: {text}" for path in sorted(parts)]
+    return [f"error: {path.parent.name}/{path.name}: is not finished" for path in sorted(parts)]
 
 
 async def test_a_session_whose_frames_are_all_unfinished_is_not_finished_and_nothing_else(session):
     parts = [as_left(path) for path in (session / "frames").iterdir()]
-    assert errors(session) == not_finished(parts)
+    assert [text.partition("; ")[0] for text in errors(session)] == not_finished(parts)
     assert notes(session) == []
 
 
@@ -260,7 +257,7 @@ async def test_a_session_whose_frames_are_all_unfinished_is_not_finished_and_not
 @pytest.mark.parametrize("number", [0, 1, 2])
 async def test_what_is_in_a_segment_that_was_not_read_is_not_called_missing(session, series, number):
     part = as_left(session / series / f"{number:04d}.mcap")
-    assert errors(session) == not_finished([part])
+    assert [text.partition("; ")[0] for text in errors(session)] == not_finished([part])
     assert notes(session) == []
 
 
@@ -273,7 +270,7 @@ async def test_a_session_that_is_being_recorded_has_no_error_at_any_time(tmp_pat
 
     await recorded(tmp_path / "s", items)
     assert len(found) >= SECONDS
-    assert {text.partition(".mcap.part: ")[2] for text in found} == {"is being recorded now and was not read"}
+    assert all(".mcap.part: is being recorded" in text for text in found)
     assert verify(tmp_path / "s").findings == ()
 
 
@@ -284,7 +281,7 @@ async def test_a_session_without_telemetry_is_reported(session):
 
 async def test_a_segment_of_another_place_is_reported(session):
     shutil.copy(session / "frames" / "0001.mcap", session / "frames" / "0002.mcap")
-    assert "error: frames/0002.mcap: records another place in the session than its name" in errors(session)
+    assert any(text.startswith("error: frames/0002.mcap: records another place") for text in errors(session))
 
 
 async def test_losses_the_recording_tells_of_are_notes(tmp_path):
@@ -294,7 +291,7 @@ async def test_losses_the_recording_tells_of_are_notes(tmp_path):
 
     directory = await recorded(tmp_path / "s", items)
     assert errors(directory) == []
-    assert notes(directory) == ["note: 2 frames of step 5 (capture) lost by the camera or its wire"]
+    assert [text.partition(" lost ")[0] for text in notes(directory)] == ["note: 2 frames of step 5 (capture)"]
 
 
 async def test_frames_the_recorder_says_it_lost_are_notes(tmp_path):
@@ -307,7 +304,7 @@ async def test_frames_the_recorder_says_it_lost_are_notes(tmp_path):
     directory = await recorded(tmp_path / "s", items)
     (directory / "frames" / "0001.mcap").unlink()
     assert errors(directory) == ["error: frames/0001.mcap: is missing"]
-    assert notes(directory)[0].endswith(" UTC: lost by the recorder, as its events say")
+    assert ": lost by the recorder" in notes(directory)[0]
     assert notes(directory)[1].startswith("note: 2026-01-01 18:00:11 UTC: frames lost: 4 (blocks 104 to")
 
 
@@ -320,10 +317,9 @@ async def test_silence_of_everything_and_of_one_device_are_notes(tmp_path):
 
     directory = await recorded(tmp_path / "s", items, seconds=40, segment_s=60.0)
     assert errors(directory) == []
-    assert notes(directory) == [
-        "note: everything was silent from 2026-01-01 18:00:03 to 2026-01-01 18:00:15 UTC (12.0 s)",
-        "note: thermometers was silent from 2026-01-01 18:00:19 to 2026-01-01 18:00:30 UTC (11.0 s)",
-    ]
+    everything, thermometers = (text.split(" from ") for text in notes(directory))
+    assert everything == ["note: everything was silent", "2026-01-01 18:00:03 to 2026-01-01 18:00:15 UTC (12.0 s)"]
+    assert thermometers == ["note: thermometers was silent", "2026-01-01 18:00:19 to 2026-01-01 18:00:30 UTC (11.0 s)"]
 
 
 def every(period_s, *stretches):
@@ -372,4 +368,4 @@ async def test_a_segment_of_another_session_is_reported(session, tmp_path):
     other = await recorded(tmp_path / "other")
     data = (other / "frames" / "0001.mcap").read_bytes().replace(b"night-1", b"night-2")
     (session / "frames" / "0001.mcap").write_bytes(data)
-    assert "error: frames/0001.mcap: belongs to another session than the other segments" in errors(session)
+    assert any(text.startswith("error: frames/0001.mcap: belongs to") for text in errors(session))

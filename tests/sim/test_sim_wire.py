@@ -20,7 +20,7 @@ def plugged(path: Path) -> PtyWire:
 def test_a_line_that_another_simulator_answers_at_is_refused_and_goes_on(tmp_path: Path):
     first = plugged(tmp_path / "linear")
     terminal = os.readlink(tmp_path / "linear")
-    with pytest.raises(OSError, match=rf"another simulator answers at serial:{tmp_path}/linear"):
+    with pytest.raises(OSError, match=rf"serial:{tmp_path}/linear"):
         plugged(tmp_path / "linear")
     assert os.readlink(tmp_path / "linear") == terminal
     first.unplug()
@@ -38,6 +38,6 @@ def test_a_link_that_a_killed_simulator_has_left_is_taken_over(tmp_path: Path):
 
 def test_what_is_no_simulators_is_not_replaced(tmp_path: Path):
     (tmp_path / "ttyUSB0").write_text("a port")
-    with pytest.raises(OSError, match="is no line of a simulator"):
+    with pytest.raises(OSError, match="no line of"):
         plugged(tmp_path / "ttyUSB0")
     assert (tmp_path / "ttyUSB0").read_text() == "a port"

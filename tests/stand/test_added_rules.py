@@ -100,7 +100,6 @@ async def test_it_trips_and_its_event_has_advice_alert_and_row():
         Alert("hold", "guard", "lasting"),
     )
     assert next_command(trip.kind, trip.data)
-    assert "| `guard.room_hot` that only warns | warning | the laboratory is too warm | open a window |" in (
-        troubleshooting()
-    )
+    (row,) = [line for line in troubleshooting().splitlines() if line.startswith("| `guard.room_hot` that only warns")]
+    assert row.split(" | ")[1] == "warning"
     await assembly.stand.safety.close()

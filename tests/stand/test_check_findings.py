@@ -19,10 +19,9 @@ def looked(folder: Path, **settings: object) -> tuple[str, str, str]:
 
 
 def test_the_newest_picture_of_an_imager_is_looked_at(tmp_path: Path):
-    assert looked(tmp_path / "card")[1:] == (
-        "failed",
-        f"{tmp_path / 'card'} cannot be read (No such file or directory)",
-    )
+    verdict, text = looked(tmp_path / "card")[1:]
+    assert verdict == "failed"
+    assert text.startswith(f"{tmp_path / 'card'} cannot be read")
     assert looked(tmp_path)[:2] == ("reading", "unverified")
     (tmp_path / "IR_0001.jpg").write_bytes(jpeg_of(RadiometricShot(WARM, 1.7e9)))
     what, verdict, text = looked(tmp_path, serial_number="49001234")

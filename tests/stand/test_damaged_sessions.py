@@ -75,9 +75,7 @@ def test_segments_deleted_from_the_end_make_a_complete_run_incomplete(session: P
     remove(session, "frames", 3, 4)
     assert words_everywhere(session, 1) == ("complete", "incomplete")
     said = " ".join(ask("info", session).stdout.split())
-    assert (
-        "missing telemetry/0004.mcap: is missing, with all that followed: journal.jsonl says that the run ended" in said
-    )
+    assert "missing telemetry/0004.mcap: is missing" in said
 
 
 @pytest.fixture

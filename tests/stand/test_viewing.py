@@ -127,4 +127,4 @@ async def test_a_session_that_cannot_be_read_is_reported_and_frames_are_looked_a
         preview = await looked_at(found, hub, START_NS + 1, "fit")
         assert preview.reference_ns == START_NS
         await asyncio.sleep(0)
-    assert "the run's own is not found" in reported[-1]
+    assert "is not found" in reported[-1]

@@ -95,7 +95,8 @@ async def test_each_warning_says_what_to_type(tmp_path: Path):
         run.publish(Event(BEGIN_NS, "warning", "held", "held by an operator's pause", {"reason": "operator"}))
     (line,) = run.lines
     assert line.startswith("warning: 2026-01-01 1")
-    assert line.endswith(" UTC  held by an operator's pause; `stand continue` ends the pause")
+    assert "an operator's pause" in line
+    assert "`stand continue`" in line
 
 
 @pytest.mark.parametrize(

@@ -63,10 +63,8 @@ async def test_a_stand_with_a_commercial_chamber_needs_no_relay_board(
     session = Session.open(await run_virtual(chamber_order(make), tmp_path / "out", None, ignore))
     events = {event.kind: event for event in session.events()}
     assert not [kind for kind in events if kind.startswith("guard.")]
-    assert events["no_dead_man"].data == {
-        "device": "regulator",
-        "ends_it": "nothing: it goes on at its set-point, within the limits of its own controller",
-    }
+    assert events["no_dead_man"].data["device"] == "regulator"
+    assert events["no_dead_man"].data["ends_it"].startswith("nothing: ")
     _, pv_degC = session.readings("regulator.pv")
     assert max(pv_degC) > 25
     assert session.readings("regulator.running")[1][-1] == 0

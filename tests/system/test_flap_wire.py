@@ -146,7 +146,7 @@ async def test_an_error_of_the_drive_ends_the_move_and_stays_in_the_readings(
         await asyncio.gather(flap.move_open(), bench.after(0.5, strike))
     position = await bench.position()
     assert (position.quality, position.value) == (Quality.STALE, pytest.approx(0.5, abs=0.001))
-    assert position.reason == f"the motor is not driven: {names}"
+    assert position.reason.endswith(names)
     with pytest.raises(DeviceFault, match=names):
         await flap.make_safe()
 
@@ -158,7 +158,7 @@ async def test_when_the_cause_is_gone_the_flap_closes_though_the_error_is_latche
     await flap.move_open()
     bench.fake.active_errors = bits
     bench.fake.active_errors = 0
-    assert (await bench.position()).reason == f"the motor is not driven: {names}"
+    assert (await bench.position()).reason.endswith(names)
     await flap.make_safe()
     assert bench.openness == 0
     assert (await bench.position()).quality is Quality.GOOD

@@ -57,10 +57,14 @@ def test_every_test_is_reported_once_also_when_one_ends_its_worker(tmp_path: Pat
     said = pytest_in(tmp_path, "-v", "-rfE")
     assert re.search(r"3 failed, 41 passed, 1 error in", said), said
     assert sorted(
-        re.findall(r"^(?:FAILED|ERROR) (\S+) - (.*)$", re.sub(r"worker \d", "worker N", said), re.MULTILINE)
+        re.findall(
+            r"^(?:FAILED|ERROR) (\S+) - (.*)$",
+            re.sub(r"worker \d ended .* test", "worker N ended", said),
+            re.MULTILINE,
+        )
     ) == [
         ("test_ends.py::test_after_it", "ValueError: at its end"),
-        ("test_ends.py::test_ends_its_worker_and_leaves_a_process", "worker N ended in this test, with 3"),
+        ("test_ends.py::test_ends_its_worker_and_leaves_a_process", "worker N ended, with 3"),
         ("test_ends.py::test_fails", "AssertionError"),
         ("test_many.py::test_each[7]", "assert 7 != 7"),
     ]
