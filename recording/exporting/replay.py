@@ -112,7 +112,7 @@ async def replay_and_record(
     if session.holes:
         info = replace(info, holes=holes_text(session.holes))
     with new_folder(out) as folder:
-        devices = recorded_devices(session)
+        devices = recorded_devices(session.telemetry_segments)
         recorder = Recorder(folder, info, session.attachments, devices, hub, clock, settings=settings)
         recorder.start()
         background = [recorder.run()] + ([clock.run()] if isinstance(clock, VirtualClock) else [])

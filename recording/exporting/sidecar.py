@@ -10,10 +10,10 @@ import numpy as np
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.instants import utc_text
 from thermostand.recording.exporting.tables import Cell, Column
-from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.format import messages
 from thermostand.recording.format.images import windows_of
 from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
 
 SIDECAR_COLUMNS = (
@@ -75,7 +75,7 @@ class StandTemperatures:
         warm = [channel for channel, unit in session.units().items() if unit == "degC"]
         usual = [
             f"{name}.{channel.name}"
-            for name, device in recorded_devices(session).items()
+            for name, device in recorded_devices(session.telemetry_segments).items()
             for channel in device.channels
         ]
         names = [*(name for name in usual if name in warm), *(name for name in warm if name not in usual)]

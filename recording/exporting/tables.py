@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
-from thermostand.foundation.errors import SessionError
+from thermostand.foundation.extras import import_extra
 from thermostand.foundation.instants import utc_text
 
 TableFormat = Literal["csv", "parquet"]
 Cell = int | float | str | None
 
+_PARQUET = ("parquet", ", or choose CSV")
 # Rows of a Parquet row group: what is held in memory per table.
 GROUP_ROWS = 8192
 
@@ -80,7 +80,7 @@ class ParquetTable:
     """A Parquet file: words as dictionaries, instants as UTC time stamps of ns."""
 
     def __init__(self, path: Path, columns: Sequence[Column]) -> None:
-        self._arrow = _arrow("pyarrow")
+        self._arrow = import_extra("pyarrow", *_PARQUET)
         types = {
             "ns": self._arrow.int64(),
             "utc": self._arrow.timestamp("ns", "UTC"),
@@ -90,7 +90,7 @@ class ParquetTable:
             "text": self._arrow.string(),
         }
         self._schema = self._arrow.schema([(column.name, types[column.type]) for column in columns])
-        self._writer = _arrow("pyarrow.parquet").ParquetWriter(path, self._schema)
+        self._writer = import_extra("pyarrow.parquet", *_PARQUET).ParquetWriter(path, self._schema)
         self._rows: list[Sequence[Cell]] = []
 
     def add(self, row: Sequence[Cell]) -> None:
@@ -118,14 +118,4 @@ TABLES: dict[TableFormat, type[CsvTable] | type[ParquetTable]] = {"csv": CsvTabl
 def check_format(table_format: TableFormat) -> None:
     """SessionError when tables of that format cannot be written here."""
     if table_format == "parquet":
-        _arrow("pyarrow.parquet")
-
-
-def _arrow(module: str) -> Any:
-    """pyarrow is optional, and has no types."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise SessionError(
-            "Parquet needs pyarrow, which is not installed: pip install 'thermostand[parquet]', or choose CSV"
-        ) from error
+        import_extra("pyarrow.parquet", *_PARQUET)

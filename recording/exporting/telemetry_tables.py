@@ -13,12 +13,12 @@ from pathlib import Path
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Channel, Reading
 from thermostand.recording.exporting.tables import TABLES, Cell, Column, TableFormat, TableWriter
-from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import READINGS, fields_of
 from thermostand.recording.format.decoded_items import item_of
 from thermostand.recording.format.records import telemetry_messages
 from thermostand.recording.format.utc_offsets import UtcOffsets
+from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
 
 TIME_COLUMNS = (Column("time_ns", "ns"), Column("time_utc", "utc"))
@@ -83,7 +83,7 @@ def _described(meta: messages.FrameMeta, utc: UtcOffsets) -> Sequence[Cell]:
 
 def _channels(session: Session) -> dict[str, tuple[Channel, ...]]:
     """What each device declares, then what it was read to measure besides."""
-    found = {name: device.channels for name, device in recorded_devices(session).items()}
+    found = {name: device.channels for name, device in recorded_devices(session.telemetry_segments).items()}
     for channel, unit in session.units().items():
         device, _, name = channel.removesuffix(f" ({unit})").partition(".")
         if device in found and (name, unit) not in [(each.name, each.unit) for each in found[device]]:

@@ -10,19 +10,36 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from thermostand.foundation.errors import SessionError
+from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Batch
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchForm
 from thermostand.recording.format.records import RecordedMessage
 
-Column = tuple[NDArray[np.int64], NDArray[np.float64]]
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Column(NamedTuple):
+    """The readings of a channel in order of time, (n,) each: instants of the stand's clock, ns since 1970, and values,
+    NaN where the reading was BAD."""
+
+    time_ns: NDArray[np.int64]
+    value: NDArray[np.float64]
+
+    def to_pandas(self) -> pd.Series[float]:
+        """The values over their instants, datetime64[ns] of the stand's clock. SessionError when pandas is not
+        installed (extra `arrays`)."""
+        values = import_extra("pandas", "arrays").Series(self.value, self.time_ns.astype("datetime64[ns]"))
+        return values.rename_axis("time")
+
 
 Part = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]  # numbers of the messages, times, values
 
@@ -140,4 +157,4 @@ class ReadingColumns:
 def _sorted(parts: list[Part]) -> Column:
     numbers, times_ns, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     order = np.lexsort((numbers, times_ns))
-    return times_ns[order], values[order]
+    return Column(times_ns[order], values[order])

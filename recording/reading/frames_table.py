@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.foundation.errors import SessionError
+from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Event, StepMark
 from thermostand.recording.format.layout import FRAMES
 from thermostand.recording.format.records import FramePlace
 from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.columns import Column
 from thermostand.recording.reading.interpolation import Float, interpolated
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _AIR = "thermometers.air"
 
@@ -59,7 +63,7 @@ class FramesTable:
         for name, column in columns[:8]:
             shown = ", ".join(map(str, column[:3])) + (", ..." if len(column) > 3 else "")
             lines.append(f"  {name:<{width}}  {shown}")
-        lines.append("  " + ", ".join(name for name, _ in columns[8:]) + "; columns() for pandas.DataFrame")
+        lines.append("  " + ", ".join(name for name, _ in columns[8:]) + "; to_pandas(), to_arrow()")
         return "\n".join(lines)
 
     def columns(self) -> dict[str, NDArray[np.generic]]:
@@ -78,6 +82,15 @@ class FramesTable:
         )
         own: dict[str, NDArray[np.generic]] = {name: getattr(self, name) for name in names}
         return own | {f"{axis}_position": column for axis, column in self.positions.items()}
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The columns, a row for each frame. SessionError when pandas is not installed (extra `arrays`)."""
+        return import_extra("pandas", "arrays").DataFrame(self.columns())
+
+    def to_arrow(self) -> Any:
+        """The columns as a pyarrow.Table, for polars (`polars.from_arrow`), DuckDB and others that read Arrow.
+        SessionError when pyarrow is not installed (extra `parquet`)."""
+        return import_extra("pyarrow", "parquet").table(self.columns())
 
 
 class Recorded(Protocol):

@@ -14,13 +14,14 @@ from itertools import accumulate, chain, pairwise
 from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
 from thermostand.foundation.errors import NotThere, SessionError
+from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Event, Item, Original, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
@@ -57,6 +58,9 @@ from thermostand.recording.reading.columns import Column, ReadingColumns
 from thermostand.recording.reading.frames_table import FramesTable, frames_table
 from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import Depth, Scan, frames_of_plan, scan
+
+if TYPE_CHECKING:
+    from thermostand.recording.reading.lazy_arrays import SessionArrays
 
 T = TypeVar("T")
 _UNFINISHED = (SegmentState.UNFINISHED, SegmentState.RECORDING)
@@ -143,8 +147,8 @@ class Session:
         return {channel: self._units[channel] for channel in self.channels()}
 
     def readings(self, channel: str) -> Column:
-        """(time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD. SessionError when the
-        session has no such channel."""
+        """(time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD; `.to_pandas()` is a
+        Series of it. SessionError when the session has no such channel."""
         device = channel.partition(".")[0]
         if device not in self._columns and not self._all_columns_read:
             self._columns[device] = self._read_columns(device).get(device, {})
@@ -157,7 +161,7 @@ class Session:
         """As `readings`, without those that were recorded in doubt."""
         times_ns, values = self.readings(channel)
         kept = ~np.isin(times_ns, self._doubted.get(channel, []))
-        return times_ns[kept], values[kept]
+        return Column(times_ns[kept], values[kept])
 
     def _all_columns(self) -> dict[str, Column]:
         if not self._all_columns_read:
@@ -215,6 +219,15 @@ class Session:
     def frames_table(self) -> FramesTable:
         """What is known of each frame as columns; no image is decoded."""
         return frames_table(self, list(self._places()))
+
+    def to_xarray(self) -> SessionArrays:
+        """The frames of each camera as a Dataset with a lazy dask array, and `telemetry` as another; only the tables of
+        the frames are read now. SessionError when xarray or dask is not installed (extra `arrays`)."""
+        for package in ("xarray", "dask.array"):
+            import_extra(package, "arrays")
+        from thermostand.recording.reading.lazy_arrays import SessionArrays  # a program that has none need not wait
+
+        return SessionArrays(self, list(self._places()), lambda: self.utc)
 
     def frame(self, index: int) -> Frame:
         """The frame of that index, counted from 0 in order of time; SessionError when there is none."""

@@ -16,7 +16,18 @@ from tests.bench.figures import Figure, Missing, progress, skipped, table
 
 BENCHMARKS = (
     *("virtual_time", "night", "abort", "jitter", "viewers", "regulators", "camera", "calibration", "codec"),
-    *("line_rate", "reading", "listing", "markers", "photographs", "claimed_variances", "drift", "datasheet", "dwells"),
+    *(
+        "line_rate",
+        "reading",
+        "arrays",
+        "listing",
+        "markers",
+        "photographs",
+        "claimed_variances",
+        "drift",
+        "datasheet",
+        "dwells",
+    ),
     *("known", "warp", "c_header", "pipeline", "cluster", "identification", "start", "stop", "page"),
 )
 """Modules of this folder with `figures(directory)`, which gives the lines of the table."""

@@ -64,12 +64,12 @@ def figures(directory: Path) -> list[Figure]:
 def _write_sessions(small: Path, large: Path, night: Path) -> None:
     progress("reading, 5 GB of frames are written")
     _write_frames(large)
-    _write_telemetry(large, SEGMENTS * FRAMES_PER_SEGMENT // 2)
+    write_telemetry(large, SEGMENTS * FRAMES_PER_SEGMENT // 2)
     (small / FRAMES).mkdir(parents=True)
     os.link(large / FRAMES / "0000.mcap", small / FRAMES / "0000.mcap")
-    _write_telemetry(small, FRAMES_PER_SEGMENT // 2)
+    write_telemetry(small, FRAMES_PER_SEGMENT // 2)
     progress("reading, 16 h of telemetry are written")
-    _write_telemetry(night, NIGHT_s)
+    write_telemetry(night, NIGHT_s)
 
 
 def _series(folder: Path, topics: tuple[Topic, ...], compression: CompressionType, segment_bytes: int) -> Series:
@@ -93,7 +93,8 @@ def _frame(number: int, image: NDArray[np.uint8]) -> Frame:
     return Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, number, time_ns)
 
 
-def _write_telemetry(session: Path, duration_s: int) -> None:
+def write_telemetry(session: Path, duration_s: int) -> None:
+    """Seven devices, each read every second."""
     encoder = TelemetryEncoder(DEVICES)
     series = _series(session / TELEMETRY, telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000)
     image = np.zeros((1, 1), np.uint8)

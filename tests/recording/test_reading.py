@@ -20,12 +20,12 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Channel, Frame, Quality, Reading, bad_reading
 from thermostand.recording.exporting.export import export
-from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import RecordedDevice
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.records import frame_places, telemetry_messages
+from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.forms import frames_topics, telemetry_topics
 from thermostand.recording.writing.recorder import Recorder
@@ -306,7 +306,9 @@ def test_a_channel_whose_unit_has_changed_is_two(tmp_path):
     assert session.readings("lab.pressure (mmHg)")[1].tolist() == [760.0]
     part = Session.open(trim(session, tmp_path / "part", START_NS, at(9)))
     assert part.units() == session.units()
-    assert list(recorded_devices(part).values()) == list(recorded_devices(session).values())
+    assert list(recorded_devices(part.telemetry_segments).values()) == list(
+        recorded_devices(session.telemetry_segments).values()
+    )
     assert [item.readings for item in part.items() if isinstance(item, Batch)] == [
         item.readings for item in session.items()
     ]

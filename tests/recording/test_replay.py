@@ -23,7 +23,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame
 from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
-from thermostand.recording.exporting.topics import recorded_devices, recorded_topics
+from thermostand.recording.exporting.topics import recorded_topics
+from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
 
 
@@ -166,7 +167,7 @@ async def test_nothing_is_overwritten_by_a_replay(tmp_path):
 
 async def test_a_session_tells_which_devices_it_recorded(tmp_path):
     await record(tmp_path / "s", 1)
-    devices = recorded_devices(Session.open(tmp_path / "s"))
+    devices = recorded_devices(Session.open(tmp_path / "s").telemetry_segments)
     assert devices == DEVICES
     assert [name for name, device in devices.items() if device.kind == "axis"] == ["rotary", "linear"]
 

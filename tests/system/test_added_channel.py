@@ -19,7 +19,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Channel
 from thermostand.recording.exporting.export import export
-from thermostand.recording.exporting.topics import recorded_devices
+from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.assembly import recorded_devices as declared_devices
@@ -153,7 +153,7 @@ async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_pa
     session = Session.open(
         await run_virtual(order(RECIPE, devices={"lab": lab()}), tmp_path / "out", None, lambda _: None)
     )
-    declared = recorded_devices(session)["lab"]
+    declared = recorded_devices(session.telemetry_segments)["lab"]
     assert (declared.kind, declared.channels) == (
         "station",
         (

@@ -1,0 +1,117 @@
+"""A region of 200 x 200 px of every frame by `session.to_xarray()`, beside reading and decompressing the same chunks.
+
+400 frames of 5 MP with 3 DN of noise, as the recorder compresses them; each round is a process of its own, so that its
+memory is its own, too. The peer reads the chunks by their places and gives them to zstandard, in one thread, without
+looking at a CRC.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from mcap.writer import CompressionType
+
+from tests.bench.figures import Figure, at_most, in_turns, progress, ratio_at_most, side_by_side
+from tests.bench.reading import ATTACHMENTS, FRAME_PERIOD_NS, METADATA, START_NS, HEIGHT_px, WIDTH_px, write_telemetry
+from tests.recording.stored import CAMERA_TOPICS, stored
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.readings import Frame
+from thermostand.recording.format.layout import FRAMES
+from thermostand.recording.format.mcap_bytes import RECORD, chunk_head
+from thermostand.recording.format.records import frame_places
+from thermostand.recording.reading.session import Session
+from thermostand.recording.writing.segment import SeriesForm
+from thermostand.recording.writing.series import Series
+
+COUNT = 400
+ROUNDS = 5
+
+
+def figures(directory: Path) -> list[Figure]:
+    """The ratio of the times, the memory, and what opening takes."""
+    session = directory / "arrays"
+    progress(f"arrays, {COUNT} frames are written")
+    _write(session)
+    try:
+        runs: list[dict[str, float]] = []
+
+        def ours() -> float:
+            runs.append(_measure(session, "region"))
+            return runs[-1]["s"]
+
+        own, peer = in_turns(ours, lambda: _measure(session, "chunks")["s"], ROUNDS)
+        opened = [run["open_ms"] for run in runs]
+        memory = [run["MB"] for run in runs]
+    finally:
+        shutil.rmtree(session, ignore_errors=True)
+    what = f"arrays: 200 x 200 px of {COUNT} frames"
+    return [
+        ratio_at_most(1.3, side_by_side(what, "s", "read and zstd alone", own, peer)),
+        at_most(300, Figure(what, "MB", max(memory), "more than with the packages loaded")),
+        at_most(200, Figure(f"arrays: to_xarray, camera, {COUNT} frames", "ms", sorted(opened)[len(opened) // 2])),
+    ]
+
+
+def _write(session: Path) -> None:
+    folder = session / FRAMES
+    folder.mkdir(parents=True)
+    form = SeriesForm(folder.name, CAMERA_TOPICS, CompressionType.ZSTD, METADATA, ATTACHMENTS, 10**9, 600 * NS_PER_S)
+    series = Series(folder, form)
+    noise = np.random.default_rng(1).normal(120, 3, (HEIGHT_px + 100, WIDTH_px)).astype(np.uint8)
+    for number in range(COUNT):
+        time_ns = START_NS + number * FRAME_PERIOD_NS
+        image = noise[number % 100 :][:HEIGHT_px]
+        series.commit(stored(Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, number, time_ns)), time_ns)
+    series.finish()
+    write_telemetry(session, COUNT // 2)
+
+
+def _measure(session: Path, what: str) -> dict[str, float]:
+    command = [sys.executable, "-m", __name__, str(session), what]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def _region(path: Path) -> dict[str, float]:
+    for package in ("xarray", "dask.array"):  # they are loaded by whoever uses them, before the time counts
+        importlib.import_module(package)
+    session = Session.open(path)
+    base_MB = _peak_MB()
+    begin_s = time.perf_counter()
+    image = session.to_xarray()["camera"].image
+    open_ms = 1e3 * (time.perf_counter() - begin_s)
+    begin_s = time.perf_counter()
+    region = image[:, 900:1100, 1100:1300].compute()
+    assert region.shape == (COUNT, 200, 200)
+    return {"s": time.perf_counter() - begin_s, "open_ms": open_ms, "MB": _peak_MB() - base_MB}
+
+
+def _peak_MB() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _chunks(path: Path) -> dict[str, float]:
+    session = Session.open(path)
+    begin_s = time.perf_counter()
+    count = 0
+    for segment in session.frame_segments:
+        for place in frame_places(segment):
+            with segment.open("rb", buffering=0) as file:
+                file.seek(place.chunk.offset)
+                content = memoryview(file.read(place.chunk.length))[RECORD.size :]
+            head = chunk_head(content, len(content))
+            count += len(zstandard.ZstdDecompressor().decompress(content[head.begin :], head.size_bytes)) > 0
+    assert count == COUNT
+    return {"s": time.perf_counter() - begin_s}
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps({"region": _region, "chunks": _chunks}[sys.argv[2]](Path(sys.argv[1]))))
