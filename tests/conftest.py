@@ -21,7 +21,7 @@ from tests.workers import run_units
 from thermostand.recording.writing import notices
 
 # How long an example takes says how busy the machine is.
-settings.register_profile("day", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("day", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("night", settings.get_profile("day"), max_examples=500)
 settings.load_profile("day")
 

@@ -126,7 +126,7 @@ def test_the_air_stays_below_its_limit_in_every_failure(
     record_property("outcome", table(found))
 
 
-@pytest.mark.parametrize(("recipe", "chamber_seed"), [("demo", 0), by_night("warm-up", 2)])
+@pytest.mark.parametrize(("recipe", "chamber_seed"), [("trial", 0), by_night("demo", 0), by_night("warm-up", 2)])
 def test_a_good_night_is_left_alone(recipe: str, chamber_seed: int):
     assert objections(Chamber(chamber_seed), Player(recipe, interrupted=True).actions()) == []
 

@@ -13,7 +13,7 @@ from tests.asking import ask, ask_status
 from tests.journals import read_lines
 from tests.system.test_attended import PROMPTED
 from tests.system.test_guard_run import check_safe
-from tests.system.test_resume import NIGHT, check, check_soaks
+from tests.system.test_resume import ONE_SET_POINT, check, check_soaks
 from thermostand.foundation.errors import SessionError, StandError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item, StepMark, StepState
@@ -31,7 +31,7 @@ def pressed(directory: Path, do: str) -> object:
 async def press(out: Path, run: asyncio.Task[Path], seed: int, news: asyncio.Event) -> list[object]:
     """Any request, from before the run is there on; what came back. Nobody leaves a pause behind."""
     rng, answers = random.Random(seed), list[object]()
-    while not run.done() and len(answers) < 150:
+    while not run.done() and len(answers) < 90:
         waiting = asyncio.create_task(news.wait())
         await asyncio.wait([run, waiting], return_when=asyncio.FIRST_COMPLETED)
         waiting.cancel()
@@ -46,7 +46,7 @@ async def press(out: Path, run: asyncio.Task[Path], seed: int, news: asyncio.Eve
 
 
 async def test_a_night_with_two_restless_operators_is_whole(tmp_path: Path, order: Callable[..., Order]):
-    ordered, out = order(NIGHT), tmp_path / "out"
+    ordered, out = order(ONE_SET_POINT), tmp_path / "out"
     news = asyncio.Event(), asyncio.Event()  # virtual time stands still as long as somebody has something to do
 
     def watch(hub: Hub) -> None:

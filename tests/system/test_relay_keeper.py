@@ -105,7 +105,7 @@ async def test_heat_that_the_timer_of_a_silent_board_ends_is_known_as_ended_unti
 
 
 async def test_permits_that_are_renewed_in_time_are_never_taken_for_dropped(bench: Bench):
-    await bench.start(10, 3600)
+    await bench.start(10, 900)
     assert kinds(bench, "compressor_dropped", "heater_enable_dropped", "switched_off", "guard_late") == []
     assert await bench.plant("compressor_on") == 1
     await bench.end()

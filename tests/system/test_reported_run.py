@@ -150,6 +150,7 @@ def test_a_run_whose_frames_allow_no_fit_is_complete_and_says_so(out: Path, conf
     assert not (directory / MODEL_NAME).exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("compiled_fit")
 def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, config_text: Callable[..., str]):
     ended = run_here(WARM_UP_ALONE, config_text(camera=WHOLE_SENSOR), out)

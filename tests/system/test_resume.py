@@ -33,6 +33,7 @@ from thermostand.stand.service.run import Interrupted, resume, run_virtual
 from thermostand.stand.simulator import ControlSocket
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")
+ONE_SET_POINT = NIGHT.replace("[30, 20, 24]", "[30]").replace("[20]", "[]")
 ITEMS_PER_LIFE = 400  # about a set-point's worth: with fewer the night would hardly get on
 
 
@@ -139,7 +140,7 @@ def test_a_night_killed_at_three_random_moments_is_one_whole_session(tmp_path: P
 
 def test_a_capture_that_was_killed_is_completed_at_its_temperature(tmp_path: Path, order: Callable[..., Order]):
     """In the second capture, at 30 degC: the chamber that the next daemon finds has to soak again first."""
-    ordered = order(NIGHT.replace("[30, 20, 24]", "[30]").replace("[20]", "[]"))
+    ordered = order(ONE_SET_POINT)
     directory, acknowledged = killed_and_resumed(ordered, tmp_path / "out", [(2 + 3, "Frame")])
     session = check(directory, ordered, acknowledged)
     kinds = [event.kind for event in session.events()]
@@ -155,7 +156,7 @@ def test_a_capture_that_was_killed_is_completed_at_its_temperature(tmp_path: Pat
 async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    ordered, out = order(NIGHT), tmp_path / "out"
+    ordered, out = order(ONE_SET_POINT), tmp_path / "out"
     tasks: list[asyncio.Task[None]] = []
 
     async def pause_and_stop() -> None:
