@@ -218,7 +218,6 @@ _STAGE = "see whether it has lost its supply or slipped; "
 _SLEEP = "keep this computer awake: `systemctl mask sleep.target suspend.target`"
 _PLAN = "`stand status --plan` shows the plan"
 _QUEUE = "`stand queue list` shows the queue"
-_TRY_ALERTS = "`stand alert test` tries alerts"
 _ELSE = "`stand status` shows how it stands"  # of kinds of another version, or of an experiment's own
 _TRIPPED = "once the cause is removed, `stand clear` where a daemon has the stand, else `stand resume {folder} --clear`"
 
@@ -270,7 +269,6 @@ LIMITS_ACCEPTED = event("limits_accepted", "warning", "{said}",
 NOT_CONFIRMED_SAFE = event("not_confirmed_safe", "error", "{said}",
     "switch the stand off by hand; `stand status` says when it is safe", alert=Alert("trip", "unsafe"), counts=True)
 CONFIRMED_SAFE = event("confirmed_safe", "info", "the stand is safe", alert=Alert("trip", "unsafe", "over"))
-NOTIFY_FAILED = event("notify_failed", "warning", "{said}", _TRY_ALERTS)
 ALERT_FAILED = event("alert_failed", "warning", "an alert was not delivered: {said}", "`stand alert test` tries them")
 
 

@@ -31,7 +31,6 @@ from thermostand.stand.guarding.interlocks import (
     intrusion,
 )
 from thermostand.stand.guarding.met_errors import MetErrors
-from thermostand.stand.guarding.notify import Notifier
 from thermostand.stand.guarding.rules import Announcements, camera_measured, natures, recorded, vital, watches
 from thermostand.stand.imaging.camera_supply import SupplyLimits
 from thermostand.stand.poller import Poller
@@ -49,7 +48,6 @@ class Assembly:
     devices: Devices
     stand: Stand
     equipment: tuple[Equipment, ...]
-    notifier: Notifier  # notifies people when nobody is at the stand
     channels: ChannelCheck
 
     def pollers(self) -> tuple[Poller, ...]:
@@ -103,7 +101,6 @@ class Assembly:
             hold=hold,
             release=release,
             cut_camera=stand.cut_camera,
-            notifier=self.notifier,
             met=met,
             vital=vital(self.config),
         )
@@ -119,12 +116,8 @@ def _obeyed(regulator: Controller) -> tuple[Watch, ...]:
 
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
-    """Make every device the configuration names; nothing is opened. ConfigError when a named file, or the program of
-    guard.notify, is missing, or guard.channels does not fit the devices: a plan of the same configuration can be made
-    elsewhere."""
-    notifier = Notifier(config.guard.notify, config.guard.notify_limit_s, clock)
-    if missing := notifier.missing():
-        raise ConfigError(missing)
+    """Make every device the configuration names; nothing is opened. ConfigError when a named file is missing, or
+    guard.channels does not fit the devices: a plan of the same configuration can be made elsewhere."""
     _check_limited(config)
     bus, equipment = Bus("bus", config.bus, clock), config.equipment
     devices = make_devices(config, bus, hub, clock)
@@ -152,7 +145,6 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
         devices=devices,
         stand=stand,
         equipment=equipment,
-        notifier=notifier,
         channels=check,
     )
 

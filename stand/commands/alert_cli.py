@@ -28,25 +28,31 @@ def try_them(config: ConfigOption = "simulated") -> None:
 
     Example: stand alert test --config my-stand.yaml
     """
-    from thermostand.stand.config.alerts_section import load_secrets
+    from thermostand.stand.config.alerts_section import AlertSecrets, load_secrets
     from thermostand.stand.config.stand_config import load_config, packaged
     from thermostand.stand.serving.alerts import check_alerts
-    from thermostand.stand.serving.alerts_process import deliver, ping
+    from thermostand.stand.serving.alerts_process import deliver, ping, run_command
 
     stand = load_config(packaged("", config))
-    if stand.alerts.secrets is None:
+    alerts = stand.alerts
+    if alerts.secrets is None and not alerts.command:
         raise ConfigError(
-            f"{config}: has no alerts.secrets; name a file with `urls:` there (docs/how-to/get-alerts.md)"
+            f"{config}: has neither alerts.secrets nor alerts.command; name a file with `urls:`, or a program "
+            "(docs/how-to/get-alerts.md)"
         )
-    check_alerts(stand.alerts)
-    found = load_secrets(stand.alerts.secrets)
-    text = "This is a test: alerts of this stand arrive here."
-    failures = [said for _, said in deliver(stand.alerts.secrets, f"{stand.name}: test", text, _LIMIT_S)]
-    failures += [failure] if (failure := ping(stand.alerts.secrets, _LIMIT_S)) else []
-    for failure in failures:
+    check_alerts(alerts)
+    found = AlertSecrets() if alerts.secrets is None else load_secrets(alerts.secrets)
+    title, text = f"{stand.name}: test", "This is a test: alerts of this stand arrive here."
+    failures: list[tuple[int, str]] = []
+    if alerts.secrets is not None:
+        failures += deliver(alerts.secrets, _LIMIT_S, title, text) + ping(alerts.secrets, _LIMIT_S)
+    if alerts.command:
+        failures += run_command(alerts.command, alerts.command_limit_s, title, text)
+    for _, failure in failures:
         typer.echo(one_line(failure), err=True)
+    receivers = len(found.urls) + bool(alerts.command)
     if failures:
-        raise StandError(f"{len(failures)} of {len(found.urls) + bool(found.alive_url)} were not reached")
+        raise StandError(f"{len(failures)} of {receivers + bool(found.alive_url)} were not reached")
     alive = ", and the sign of life was taken" if found.alive_url else "; no alive_url is given"
-    line = f"{len(found.urls)} receiver{'' if len(found.urls) == 1 else 's'} took the message{alive}"
-    show({"receivers": len(found.urls), "alive": bool(found.alive_url)}, [line])
+    line = f"{receivers} receiver{'' if receivers == 1 else 's'} took the message{alive}"
+    show({"receivers": receivers, "alive": bool(found.alive_url)}, [line])

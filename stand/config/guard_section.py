@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, SerializeAsAny, field_validator, model_validator
 
@@ -82,8 +82,7 @@ class GuardConfig(Document):
     may be open outside captures, flap_capture_s in all. disk_low_s: how long the recorder may refuse frames.
     camera_temperature_s: how long a powered camera with frames to come may have no temperature.
     pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
-    hours. notify: a command that gets the sentence of a trip as its last argument; notify_limit_s: real seconds it may
-    take. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
+    hours. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
     channels: limits for what any device measures, by its channel, as `lab.pressure`.
     added: settings of rules that other packages add, by their names. safe_limit_s: how long, at the end of a run, it is
     tried to have every actuator confirm that it is safe.
@@ -118,8 +117,6 @@ class GuardConfig(Document):
     # Round number; nothing was measured.
     disk_low_s: float = Field(default=900.0, ge=0, le=36000)
     camera_temperature_s: float = Field(default=60.0, gt=0, le=36000)
-    notify: tuple[Annotated[str, Field(min_length=1)], ...] = Field(default=(), max_length=100)
-    notify_limit_s: float = Field(default=10.0, gt=0, le=60)
     accept: tuple[str, ...] = ()
     # Round number; nothing was measured.
     pause_limit_h: float = Field(default=12.0, gt=0, le=24)

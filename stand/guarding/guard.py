@@ -6,20 +6,18 @@ that); when a rule objects it latches the stand and demands that it is made safe
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
 from thermostand.foundation.errors import DeviceError
-from thermostand.foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, NOTIFY_FAILED, guard_rule
+from thermostand.foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, guard_rule
 from thermostand.foundation.hub import Hub
 from thermostand.stand.fault import Fault, Watch
 from thermostand.stand.guarding.interlocks import (
     NOT_RECORDED,
 )
 from thermostand.stand.guarding.met_errors import MetErrors
-from thermostand.stand.guarding.notify import Notifier
 from thermostand.stand.latch import Latch
 from thermostand.stand.safety import Safety
 
@@ -34,8 +32,8 @@ _ENDINGS_PER_H = 3  # of holds that end by themselves; what comes back more ofte
 class Guard:
     """Every `period_s` the rules.
 
-    On a fault `stop(fault)` ends the run, or `hold(fault)` lets it wait; the trip is recorded, the stand is made safe,
-    and `notifier` runs. A hold stays until the latch is cleared, but for one that ends by itself: `release()`, which
+    On a fault `stop(fault)` ends the run, or `hold(fault)` lets it wait; the trip is recorded, and the stand is made
+    safe. A hold stays until the latch is cleared, but for one that ends by itself: `release()`, which
     clears it, is then called when no rule objects any more and the stand has confirmed that it is safe, at most three
     times an hour. Without a `hold` every trip aborts. A guard that fails aborts. One that `keeps_on` looks on after an
     abort, which stays latched: that of a stand on which further runs follow.
@@ -60,7 +58,6 @@ class Guard:
     hold: Callable[[Fault], None] | None = None
     release: Callable[[], None] | None = None
     cut_camera: Callable[[], None] | None = None
-    notifier: Notifier | None = None
     met: MetErrors = field(default_factory=lambda: MetErrors({}))
     vital: tuple[str, ...] = ()
     keeps_on: bool = False
@@ -71,7 +68,6 @@ class Guard:
     _endings_ns: list[int] = field(default_factory=list[int])
     _is_excusing: bool = False  # the last look passed over an objection because of a look that came late
     _warned: set[int] = field(default_factory=set[int])  # watches whose warning stands
-    _telling: set[asyncio.Task[None]] = field(default_factory=set[asyncio.Task[None]])
 
     def look(self) -> bool:
         """Whether the run continues; False when the run is being aborted."""
@@ -143,7 +139,6 @@ class Guard:
 
     async def run(self) -> None:
         """Watch until cancelled or aborted."""
-        self._tell_deafness()
         try:
             due_ns = self.clock.now_ns()
             while self.look():
@@ -158,11 +153,6 @@ class Guard:
     def _is_kept(self) -> bool:
         """Whether the stand is already held for a fault that aborts."""
         return self.keeps_on and self.held is not None and self.held.action == "abort"
-
-    async def notified(self) -> None:
-        """Return when each notify command of a trip has ended, or could not be run."""
-        while self._telling:
-            await asyncio.wait(self._telling)
 
     def _abort(self, fault: Fault) -> None:
         if self.held is None or self.held.action != "abort":
@@ -204,7 +194,6 @@ class Guard:
             )
             self.latch.trip(Fault(fault.rule, text, fault.action))
             self.hub.publish(HOLD_STAYS.at(now_ns, text, **data))
-            self._notify(text)
             return
         self._endings_ns.append(now_ns)
         self.hub.publish(HOLD_ENDED.at(now_ns, fault.text, **data))
@@ -245,25 +234,3 @@ class Guard:
         if fault.cuts_camera and self.cut_camera is not None:
             self.cut_camera()
         self.hub.publish(fault.at(self.clock.now_ns()))
-        self._notify(fault.text)
-
-    def _notify(self, text: str) -> None:
-        if self.notifier is None:
-            return
-        task = asyncio.create_task(self._tell(text, self.notifier))
-        self._telling.add(task)
-        task.add_done_callback(self._telling.discard)
-
-    async def _tell(self, text: str, notifier: Notifier) -> None:
-        """With what could not be made safe, when there is such; that is known after the first try."""
-        await self.safety.tried()
-        unsafe = self.safety.unconfirmed
-        failure = await notifier.tell(f"{text}; NOT SAFE: {'; '.join(unsafe)}" if unsafe else text)
-        if failure:
-            self.hub.publish(NOTIFY_FAILED.at(self.clock.now_ns(), failure))
-
-    def _tell_deafness(self) -> None:
-        """A command that cannot be run is found now, not at the first trip."""
-        missing = "" if self.notifier is None else self.notifier.missing()
-        if missing:
-            self.hub.publish(NOTIFY_FAILED.at(self.clock.now_ns(), missing))

@@ -29,6 +29,7 @@ from thermostand.stand.service import queue
 from thermostand.stand.service.queue import Asked
 from thermostand.stand.service.queue_file import Queue, QueueEntry, QueueState, worked_on
 from thermostand.stand.service.queue_work import is_complete
+from thermostand.stand.serving.alerts import missing_command
 from thermostand.stand.serving.desk import Conflict, Missing, QueuedRun, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended
@@ -223,7 +224,7 @@ class Orders:
         cameras = assembly.devices.cameras.values()
         if captures and assembly.stand.imaging.supply.is_on and not all(camera.is_usable for camera in cameras):
             lacks.append("a camera does not answer")
-        if missing := assembly.notifier.missing():
+        if missing := missing_command(assembly.config.alerts):
             lacks.append(missing)
         if lacks:
             raise Conflict(f"this stand cannot run it now: {'; '.join(lacks)}")

@@ -32,7 +32,6 @@ from thermostand.foundation.events import (
     LIMITS_ACCEPTED,
     NO_CAMERA_TEMPERATURE,
     NO_CONTROL,
-    NOTIFY_FAILED,
     SALVAGED,
     STAND_DIFFERS,
 )
@@ -105,7 +104,6 @@ def rehearsed(order: Order) -> Order:
             changed[name] = settings.model_copy(update={"address": f"tcp:127.0.0.1:{next(ports)}"})
     update: dict[str, Any] = config.sections_with(changed) | {
         "bus": there.bus,
-        "guard": config.guard.model_copy(update={"notify": ()}),
         "compressor": config.compressor.model_copy(update={"state_file": None}),
         "alerts": there.alerts,
         "simulation": there.simulation,
@@ -317,7 +315,7 @@ async def run_in(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
         job.watch(hub)
         await _announce(job, open_stand.assembly, open_stand.disk, has_own=True)
         directory = _directory(job, open_stand.assembly.clock)
-        async with _telling_failure(open_stand.assembly, directory, stop), AsyncExitStack() as stack:
+        async with _memory_in_words(open_stand.assembly, directory), AsyncExitStack() as stack:
             disk = DiskProcess()
             stack.push_async_callback(disk.ended_within, stop.patience)
             stack.callback(open_stand.unrecorded)
@@ -374,16 +372,12 @@ async def _run(job: Job, front: Front, clock: Clock, time: Time | None, stop: St
             time = ClockWatch(hub, clock, 0 if job.before is None else job.before.utc_offset_ns).run
         assembly = assemble(job.order.config, hub, clock)
         await _announce(job, assembly)
-        assembly.notifier.start()
-        try:
-            alerts = alerting(assembly.config.name, assembly.config.alerts, hub, clock)
-            async with alerts, _telling_failure(assembly, directory, stop):
-                async with opened(assembly, time, stop, is_for_one=True) as open_stand:
-                    answer = partial(_answer, open_stand, directory, front)
-                    recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk, answer=answer)
-                _check_outcome(directory, recorder, assembly)
-        finally:
-            assembly.notifier.close()
+        alerts = alerting(assembly.config.name, assembly.config.alerts, hub, clock)
+        async with alerts, _memory_in_words(assembly, directory):
+            async with opened(assembly, time, stop, is_for_one=True) as open_stand:
+                answer = partial(_answer, open_stand, directory, front)
+                recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk, answer=answer)
+            _check_outcome(directory, recorder, assembly)
     return directory
 
 
@@ -435,16 +429,15 @@ async def _salvaged(job: Job, clock: Clock, disk: DiskProcess | None) -> tuple[S
 
 
 @asynccontextmanager
-async def _telling_failure(assembly: Assembly, directory: Path, stop: Stop) -> AsyncGenerator[None]:
-    """Those notified of trips are also notified of a run that ends by itself before its plan is complete."""
+async def _memory_in_words(assembly: Assembly, directory: Path) -> AsyncGenerator[None]:
+    """A lack of memory is a StandError that says what is not safe."""
     try:
         yield
     except Exception as raised:
-        error = cause_of(raised)
-        if stop.reason is None:  # else the guard has notified, or the operator knows
-            await _tell_failure(assembly, directory.name, error)
-        if isinstance(error, MemoryError):
-            raise StandError(f"{directory}: {failure_text(error)}{_unsafe(assembly)}") from raised
+        if isinstance(error := cause_of(raised), MemoryError):
+            unsafe = "; ".join(assembly.stand.safety.unconfirmed)
+            said = f"{directory}: {failure_text(error)}{unsafe and f'; NOT SAFE: {unsafe}'}"
+            raise StandError(said) from raised
         raise
 
 
@@ -521,18 +514,6 @@ def _check_outcome(directory: Path, recorder: Recorder, assembly: Assembly) -> N
         raise StandTripped(f"{directory}: complete, but NOT SAFE: {'; '.join(unsafe)}")
     if recorder.frames_lost:
         raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
-
-
-async def _tell_failure(assembly: Assembly, name: str, error: BaseException) -> None:
-    ending = "" if isinstance(error, StandTripped) else _unsafe(assembly)
-    if failure := await assembly.notifier.tell(f"{name} has failed: {failure_text(error)}{ending}"):
-        assembly.hub.publish(NOTIFY_FAILED.at(assembly.clock.now_ns(), failure))
-
-
-def _unsafe(assembly: Assembly) -> str:
-    """What is not confirmed safe, as the end of a sentence; "" when nothing is."""
-    unsafe = assembly.stand.safety.unconfirmed
-    return f"; NOT SAFE: {'; '.join(unsafe)}" if unsafe else ""
 
 
 class _Early:

@@ -118,35 +118,31 @@ async def serve(
         kept, damage = await asyncio.to_thread(kept_in, out)
         watch = ClockWatch(hub, clock)
         assembly = assemble(config, hub, clock)
-        assembly.notifier.start()
-        try:
-            async with AsyncExitStack() as stack:
-                open_stand = await stack.enter_async_context(opened(assembly, watch.run, stop, is_for_one=False))
-                await stack.enter_async_context(alerting(config.name, config.alerts, hub, clock, open_stand.is_well))
-                if open_stand.disk is None:
-                    raise ValueError("a daemon is on the host's clock, and has a process for its disk")
-                own = {name: text for name, text in texts.items() if name in ("config.yaml", ATTACHMENT)}
-                record = DayRecord(assembly, own, out, clock, stop.patience)
-                keep = KeptFile(out, open_stand.disk.line(FILES_LINE).run, hub, clock)
-                reports = Reports(hub, clock)
-                stack.push_async_callback(reports.close)
-                orders = Orders(open_stand, open_stand.disk, out, config_name, texts)
-                for segment in await orders.repair.call(salvage_unfinished, out):
-                    hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
-                if accepted := config.accepted():
-                    hub.publish(LIMITS_ACCEPTED.at(clock.now_ns(), accepted_text(accepted), **accepted))
-                if damage:
-                    hub.publish(DAEMON_FILE_DAMAGED.at(clock.now_ns(), damage))
-                daemon = Daemon(
-                    open_stand,
-                    orders,
-                    record,
-                    kept,
-                    keep,
-                    recorded=reports.add if has_reports else None,
-                )
-                await daemon.serve(front)
-            if unsafe := assembly.stand.safety.unconfirmed:
-                raise StandTripped(f"the daemon ends, but NOT SAFE: {'; '.join(unsafe)}")
-        finally:
-            assembly.notifier.close()
+        async with AsyncExitStack() as stack:
+            open_stand = await stack.enter_async_context(opened(assembly, watch.run, stop, is_for_one=False))
+            await stack.enter_async_context(alerting(config.name, config.alerts, hub, clock, open_stand.is_well))
+            if open_stand.disk is None:
+                raise ValueError("a daemon is on the host's clock, and has a process for its disk")
+            own = {name: text for name, text in texts.items() if name in ("config.yaml", ATTACHMENT)}
+            record = DayRecord(assembly, own, out, clock, stop.patience)
+            keep = KeptFile(out, open_stand.disk.line(FILES_LINE).run, hub, clock)
+            reports = Reports(hub, clock)
+            stack.push_async_callback(reports.close)
+            orders = Orders(open_stand, open_stand.disk, out, config_name, texts)
+            for segment in await orders.repair.call(salvage_unfinished, out):
+                hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
+            if accepted := config.accepted():
+                hub.publish(LIMITS_ACCEPTED.at(clock.now_ns(), accepted_text(accepted), **accepted))
+            if damage:
+                hub.publish(DAEMON_FILE_DAMAGED.at(clock.now_ns(), damage))
+            daemon = Daemon(
+                open_stand,
+                orders,
+                record,
+                kept,
+                keep,
+                recorded=reports.add if has_reports else None,
+            )
+            await daemon.serve(front)
+        if unsafe := assembly.stand.safety.unconfirmed:
+            raise StandTripped(f"the daemon ends, but NOT SAFE: {'; '.join(unsafe)}")

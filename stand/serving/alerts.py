@@ -1,7 +1,8 @@
 """Alerts of a stand to people elsewhere, and the sign of life to a service that raises the alarm when it stays away.
 
-The hub's subscriber only puts events into a queue. A thread judges them and asks a process of its own to send; another
-one gives the sign of life. A receiver that hangs delays later messages, and nothing else.
+Receivers are addresses of Apprise, and a command of the configuration. The hub's subscriber only puts events into a
+queue. For each kind of receiver a thread judges them and asks a process of its own to send; another one gives the sign
+of life. A receiver that hangs delays later messages to its kind, and nothing else.
 """
 
 from __future__ import annotations
@@ -9,16 +10,18 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import queue
+import shutil
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Collection, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
-from thermostand.foundation.clock import Clock, VirtualClock, boot_time_ns, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, boot_time_ns, seconds_ns
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.events import ALERT_FAILED, RUN_BEGINS, RUN_END, RUN_FAILED, TITLES, AlertCause, alert_of
 from thermostand.foundation.helper import Helper
@@ -26,7 +29,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.tasks import cancelled, cause_of, failure_text
 from thermostand.stand.config.alerts_section import AlertsConfig, load_secrets
-from thermostand.stand.serving.alerts_process import MISSING, MODULE, deliver, ping
+from thermostand.stand.serving.alerts_process import MISSING, MODULE, Failures, deliver, ping, run_command
 
 # Which events of a stand become messages: each cause once, when it has lasted, and once more when it is over.
 
@@ -114,18 +117,29 @@ class AlertBook:
         return messages
 
 
-_LIMIT_S = 20.0  # for a receiver
+_LIMIT_S = 20.0  # for an address
 _LOOK_S = 0.5
 _BEAT_S = 1.0
 _LATE_NS = seconds_ns(15.0)  # an event loop that has not come round for so long is not well
 _AGAIN_S = (15.0, 60.0, 300.0, 1200.0)  # after a try that failed: networks come back
 _MOST_WAITING = 100  # round number; nothing was measured
 _FAREWELL_S = 5.0  # real seconds for the last messages
-_TELL, _ALIVE = "tell", "alive"
+
+
+def missing_command(config: AlertsConfig) -> str:
+    """Why alerts.command cannot be run, "" when it can, or there is none."""
+    if not config.command or shutil.which(config.command[0]) is not None:
+        return ""
+    return (
+        f"alerts.command: {config.command[0]} is no program that can be run here, nobody would be alerted by it; "
+        "install it, give its whole path, or take the line out"
+    )
 
 
 def check_alerts(config: AlertsConfig) -> None:
     """ConfigError when alerts are asked for that could not be sent."""
+    if missing := missing_command(config):
+        raise ConfigError(missing)
     if config.secrets is None:
         return
     load_secrets(config.secrets)
@@ -137,15 +151,15 @@ def check_alerts(config: AlertsConfig) -> None:
 async def alerting(
     name: str, config: AlertsConfig, hub: Hub, clock: Clock, is_well: Callable[[], bool] = lambda: True
 ) -> AsyncGenerator[None]:
-    """Alerts of the stand `name` while inside, none in virtual time or without alerts.secrets. is_well: whether the
-    sign of life may be given, asked each second on the loop; what this knows of by itself (a hold, a lost device, a
-    loop that stands still) counts besides. ConfigError as check_alerts."""
+    """Alerts of the stand `name` while inside, none in virtual time or without a receiver. is_well: whether the sign of
+    life may be given, asked each second on the loop; what this knows of by itself (a hold, a lost device, a loop that
+    stands still) counts besides. ConfigError as check_alerts."""
     # A run in virtual time alarms nobody.
-    if config.secrets is None or isinstance(clock, VirtualClock):
+    if isinstance(clock, VirtualClock) or (config.secrets is None and not config.command):
         yield
         return
     await asyncio.to_thread(check_alerts, config)
-    alerts = Alerts(name, config, config.secrets, asyncio.get_running_loop(), hub, clock)
+    alerts = Alerts(name, config, asyncio.get_running_loop(), hub, clock)
     hub.subscribe(alerts)
     beating = asyncio.create_task(alerts.beat(is_well))
     try:
@@ -159,6 +173,77 @@ async def alerting(
         await asyncio.to_thread(alerts.close)
 
 
+class Alerts:
+    """A subscriber of the hub. The addresses, the command and the sign of life have a thread and a process each, so
+    that none of them waits for another."""
+
+    def __init__(
+        self, name: str, config: AlertsConfig, loop: asyncio.AbstractEventLoop, hub: Hub, clock: Clock
+    ) -> None:
+        self._every_s = config.alive_every_s
+        self._loop, self._hub, self._clock = loop, hub, clock
+        self._ending = Flag()
+        self._beat_ns = 0
+        grace_ns = seconds_ns(config.grace_s)
+        self._senders: list[_Sender] = []
+        self._deliveries: list[_Delivery] = []
+        if config.command:
+            book = AlertBook(name, config.command_causes, grace_ns, config.most_per_h)
+            send = partial(run_command, config.command, config.command_limit_s)
+            self._deliveries.append(_Delivery(book, send, self._sender("command"), clock))
+        works: list[Callable[[], None]] = []
+        if config.secrets is not None:
+            book = AlertBook(name, config.causes, grace_ns, config.most_per_h)
+            send = partial(deliver, config.secrets, _LIMIT_S)
+            self._deliveries.append(_Delivery(book, send, self._sender("addresses"), clock))
+            works.append(partial(self._ping_on, config.secrets, self._sender("alive")))
+        works += [partial(each.work, self._ending) for each in self._deliveries]
+        self._threads = [Thread(target=work, name="alerts", daemon=True) for work in works]
+        for thread in self._threads:
+            thread.start()
+
+    def __call__(self, item: Item) -> None:
+        """Take note of an event; returns at once."""
+        if isinstance(item, Event) and alert_of(item) is not None:
+            for delivery in self._deliveries:
+                delivery.events.put(item)
+
+    async def beat(self, is_well: Callable[[], bool]) -> None:
+        """The loop comes round, until cancelled."""
+        while True:
+            self._beat_ns = boot_time_ns() if is_well() else 0
+            await asyncio.sleep(_BEAT_S)
+
+    def close(self) -> None:
+        """Send what is due, as far as that goes in a few seconds; blocking. A command under way runs to its end."""
+        self._ending.set()
+        until_ns = boot_time_ns() + seconds_ns(_FAREWELL_S)
+        for thread in self._threads:
+            thread.join(max(0.0, (until_ns - boot_time_ns()) / NS_PER_S))
+        for sender in self._senders:
+            sender.close()
+
+    def _sender(self, line: str) -> _Sender:
+        self._senders.append(_Sender(line, self._warn))
+        return self._senders[-1]
+
+    def _ping_on(self, secrets: Path, sender: _Sender) -> None:
+        """The thread that gives the sign of life."""
+        due_ns = 0
+        while not self._ending.wait(_LOOK_S):
+            now_ns = boot_time_ns()
+            is_well = all(delivery.book.is_well for delivery in self._deliveries)
+            if now_ns >= due_ns and now_ns - self._beat_ns < _LATE_NS and is_well:
+                due_ns = now_ns + seconds_ns(self._every_s)
+                sender.ask(partial(ping, secrets, _LIMIT_S))
+
+    def _warn(self, failure: str) -> None:
+        """An event on the loop."""
+        event = ALERT_FAILED.at(self._clock.now_ns(), failure)
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._hub.publish, event)
+
+
 @dataclass(frozen=True, slots=True)
 class _Waiting:
     """A message to be sent, not before at_ns (of the time since boot). tried: how often it was; only: the numbers of
@@ -170,53 +255,62 @@ class _Waiting:
     only: tuple[int, ...] = ()
 
 
-class Alerts:
-    """A subscriber of the hub."""
+@dataclass
+class _Sender:
+    """A process that sends. It is there before it is needed, and started again when it has ended: a daemon that has no
+    descriptor left, or waits for a disk, need not start a program itself. warn: gets each failure once until a call has
+    succeeded."""
 
-    def __init__(
-        self, name: str, config: AlertsConfig, secrets: Path, loop: asyncio.AbstractEventLoop, hub: Hub, clock: Clock
-    ) -> None:
-        self._config, self._secrets = config, secrets
-        self._loop, self._hub, self._clock = loop, hub, clock
-        self._book = AlertBook(name, config.causes, seconds_ns(config.grace_s), config.most_per_h)
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._waiting: deque[_Waiting] = deque()
-        self._ending = Flag()
-        self._beat_ns = 0
-        self._helpers: dict[str, Helper] = {}
-        self._failed: set[str] = set()
-        works = {_TELL: self._tell_on, _ALIVE: self._ping_on}
-        self._threads = {each: Thread(target=work, name=f"alerts-{each}", daemon=True) for each, work in works.items()}
-        for thread in self._threads.values():
-            thread.start()
+    line: str
+    warn: Callable[[str], None]
+    _helper: Helper | None = None
+    _failed: set[str] = field(default_factory=set[str])
 
-    def __call__(self, item: Item) -> None:
-        """Take note of an event; returns at once."""
-        if isinstance(item, Event) and alert_of(item) is not None:
-            self._events.put(item)
+    def start(self) -> Helper:
+        """Raises OSError when it cannot be started."""
+        if self._helper is None or self._helper.ended:
+            self._helper = Helper(MODULE, (self.line,), "the process that sends alerts has ended")
+        return self._helper
 
-    async def beat(self, is_well: Callable[[], bool]) -> None:
-        """The loop comes round, until cancelled."""
-        while True:
-            self._beat_ns = boot_time_ns() if is_well() else 0
-            await asyncio.sleep(_BEAT_S)
+    def ask(self, call: partial[Failures]) -> Failures:
+        """The call's result, by the process; number 0 when that has failed."""
+        try:
+            failures = self.start().line(self.line).run(call.func, *call.args)
+        except OSError as error:
+            failures = [(0, str(error))]
+        if not failures:
+            self._failed.clear()
+        for _, failure in failures:
+            if failure not in self._failed:
+                self._failed.add(failure)
+                self.warn(failure)
+        return failures
 
     def close(self) -> None:
-        """Tell what is due, as far as that goes in a few seconds; blocking."""
-        self._ending.set()
-        self._threads[_TELL].join(_FAREWELL_S)
-        for helper in tuple(self._helpers.values()):
-            helper.close()
+        if self._helper is not None:
+            self._helper.close()
 
-    def _tell_on(self) -> None:
-        """The thread that tells. At the end everything is tried once more at once."""
+
+class _Delivery:
+    """Judges events, and sends the messages that are due to receivers of one kind: its `work` is a thread."""
+
+    def __init__(self, book: AlertBook, send: partial[Failures], sender: _Sender, clock: Clock) -> None:
+        self.book = book
+        self.events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._send, self._sender, self._clock = send, sender, clock
+        self._waiting: deque[_Waiting] = deque()
+
+    def work(self, ending: Flag) -> None:
+        """Send until `ending`. At the end everything is tried once more at once."""
+        with suppress(OSError):
+            self._sender.start()
         while True:
-            is_last = self._ending.wait(_LOOK_S)
+            is_last = ending.wait(_LOOK_S)
             now_ns = self._clock.now_ns()
-            found = list(self._book.due(now_ns))
+            found = list(self.book.due(now_ns))
             with suppress(queue.Empty):
                 while True:
-                    found += self._book.receive(self._events.get_nowait(), now_ns)
+                    found += self.book.receive(self.events.get_nowait(), now_ns)
             self._waiting.extend(_Waiting(message) for message in found)
             while len(self._waiting) > _MOST_WAITING:
                 self._waiting.popleft()
@@ -230,43 +324,7 @@ class Alerts:
         if boot_time_ns() < due.at_ns and not is_last:
             self._waiting.append(due)
             return
-        message = due.message
-        failures = self._ask(_TELL, deliver, self._secrets, message.title, message.text, _LIMIT_S, due.only)
-        if not failures:
-            self._failed.clear()
-        elif due.tried < len(_AGAIN_S):
+        failures = self._sender.ask(partial(self._send, due.message.title, due.message.text, due.only))
+        if failures and due.tried < len(_AGAIN_S):
             at_ns, of = boot_time_ns() + seconds_ns(_AGAIN_S[due.tried]), tuple(number for number, _ in failures)
-            self._waiting.append(_Waiting(message, at_ns, due.tried + 1, due.only if 0 in of else of))
-        for _, failure in failures:
-            self._warn(failure)
-
-    def _ping_on(self) -> None:
-        """The thread that gives the sign of life."""
-        due_ns = 0
-        while not self._ending.wait(_LOOK_S):
-            now_ns = boot_time_ns()
-            if now_ns >= due_ns and now_ns - self._beat_ns < _LATE_NS and self._book.is_well:
-                due_ns = now_ns + seconds_ns(self._config.alive_every_s)
-                for _, failure in self._ask(_ALIVE, ping, self._secrets, _LIMIT_S):
-                    self._warn(failure)
-
-    def _ask(self, line: str, function: Callable[..., object], *args: object) -> list[tuple[int, str]]:
-        """In a process of its own, which is started again when it has ended; what failed, with whose it is."""
-        try:
-            if line not in self._helpers or self._helpers[line].ended:
-                self._helpers[line] = Helper(MODULE, (line,), "the process that sends alerts has ended")
-            found = self._helpers[line].line(line).run(function, *args)
-        except OSError as error:
-            found = str(error)
-        if isinstance(found, str):
-            return [(0, found)] if found else []
-        return cast("list[tuple[int, str]]", found)
-
-    def _warn(self, failure: str) -> None:
-        """An event on the loop, once until a message has got through."""
-        if failure in self._failed:
-            return
-        self._failed.add(failure)
-        event = ALERT_FAILED.at(self._clock.now_ns(), failure)
-        with suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._hub.publish, event)
+            self._waiting.append(_Waiting(due.message, at_ns, due.tried + 1, due.only if 0 in of else of))

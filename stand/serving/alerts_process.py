@@ -1,7 +1,7 @@
 """The process that sends alerts for a daemon, see foundation/helper.py.
 
 A receiver that hangs hangs this process's thread, never the daemon. The secrets are read here, again for each message,
-and nothing that is returned holds any of them.
+and nothing that is returned holds any of them. A command under way when the daemon goes is run to its end.
 """
 
 from __future__ import annotations
@@ -9,8 +9,12 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import logging
+import os
+import signal
+import subprocess
 import urllib.request
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
@@ -20,12 +24,15 @@ from thermostand.stand.config.alerts_section import load_secrets
 MODULE = "thermostand.stand.serving.alerts_process"
 LEFT_NAME = "stand-alert-left"  # of a process whose daemon has gone
 MISSING = "alerts need Apprise: pip install 'thermostand[alerts]'"
+_KILLED_LIMIT_S = 1.0  # real seconds for what was killed to be gone
 
 
-def deliver(secrets: Path, title: str, text: str, limit_s: float, only: Sequence[int] = ()) -> list[tuple[int, str]]:
-    """Send to every address, or to those of these numbers (from 1) only; of each that did not take it within limit_s
-    its number and a sentence. Number 0: nothing was sent to anybody. Nobody waits for them together: each has the
-    whole time."""
+Failures = list[tuple[int, str]]
+"""Of each receiver that has not taken a message its number (from 1) and a sentence; number 0: nobody has."""
+
+
+def deliver(secrets: Path, limit_s: float, title: str, text: str, only: Sequence[int] = ()) -> Failures:
+    """Send to every address, or to those of these numbers only, limit_s real seconds for each at the same time."""
     try:
         urls = load_secrets(secrets).urls
     except ConfigError as error:
@@ -45,13 +52,45 @@ def deliver(secrets: Path, title: str, text: str, limit_s: float, only: Sequence
     ]
 
 
-def ping(secrets: Path, limit_s: float) -> str:
-    """Call the dead-man's address; why that failed, "" when it did not, or there is none."""
+def ping(secrets: Path, limit_s: float) -> Failures:
+    """Call the dead-man's address, if there is one."""
     try:
         url = load_secrets(secrets).alive_url
     except ConfigError as error:
-        return str(error)
-    return f"alive_url {failure}" if url and (failure := _Work(lambda: _called(url, limit_s)).result(limit_s)) else ""
+        return [(0, str(error))]
+    failure = _Work(lambda: _called(url, limit_s)).result(limit_s) if url else ""
+    return [(0, f"alive_url {failure}")] if failure else []
+
+
+def run_command(command: Sequence[str], limit_s: float, title: str, text: str, _only: Sequence[int] = ()) -> Failures:
+    """Run it with the message as its last argument, without a shell; kill it and its children after `limit_s` real
+    seconds."""
+    try:
+        process = subprocess.Popen(
+            [*command, f"{title}: {text}".replace("\0", " ")],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # so that Ctrl-C at the stand does not end it, and its children can be found
+        )
+    except (OSError, ValueError) as error:
+        return [(1, f"{command[0]} could not be started ({error})")]
+    try:
+        status = process.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        return [(1, f"{command[0]} did not end within {limit_s:g} s{_kill(process)}")]
+    return [(1, f"{command[0]} ended with status {status}")] if status else []
+
+
+def _kill(process: subprocess.Popen[bytes]) -> str:
+    """Kill it and its children; "" when it is gone. One that runs as another user, or hangs in the kernel, stays."""
+    with suppress(OSError):
+        os.killpg(process.pid, signal.SIGKILL)
+    try:
+        process.wait(_KILLED_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        return " and could not be killed"
+    return ""
 
 
 def _scheme(url: str) -> str:

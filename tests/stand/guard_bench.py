@@ -10,7 +10,6 @@ from thermostand.foundation.items import Event
 from thermostand.stand.fault import Fault, Readings, Rule, Watch
 from thermostand.stand.gate import Gate
 from thermostand.stand.guarding.guard import Guard
-from thermostand.stand.guarding.notify import Notifier
 from thermostand.stand.latch import Latch, LatchFile
 from thermostand.stand.safety import Safety
 
@@ -43,9 +42,6 @@ class NotedFile(LatchFile):
         return ""
 
 
-NOTIFIERS: list[Notifier] = []  # of the test
-
-
 class Bench:
     """A guard over rules whose objections a test switches."""
 
@@ -53,8 +49,6 @@ class Bench:
         self,
         *actions: Any,
         can_hold: bool = True,
-        command: tuple[str, ...] = (),
-        limit_s: float = 5.0,
         clock: Clock | None = None,
     ) -> None:
         self.log: list[str] = []
@@ -69,8 +63,6 @@ class Bench:
         hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
         watches = tuple(Watch(self._rule(index), 0.0, action) for index, action in enumerate(actions))
         stop, hold = (lambda fault, name=name: self.log.append(f"{name} {fault.rule}") for name in ("stop", "hold"))
-        notifier = Notifier(command, limit_s, self.clock)
-        NOTIFIERS.append(notifier)
         self.latch = Latch(Gate(), hub, self.clock)
         self.guard = Guard(
             safety=self.safety,
@@ -82,7 +74,6 @@ class Bench:
             stop=stop,
             hold=hold if can_hold else None,
             release=self._release,
-            notifier=notifier,
         )
 
     def clear(self) -> None:
@@ -110,7 +101,6 @@ class Bench:
         watching = asyncio.create_task(self.guard.run())
         await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
         still = not watching.done()
-        await self.guard.notified()
         for task in (watching, time):
             task.cancel()
         await asyncio.gather(watching, time, return_exceptions=True)

@@ -112,13 +112,13 @@ async def test_who_has_a_message_does_not_get_it_again_because_another_receiver_
 ):
     monkeypatch.setattr(module, "_AGAIN_S", (0.1,) * 3)
     tried: list[tuple[int, ...]] = []
-    ask = module.Alerts._ask
+    ask = module._Sender.ask
 
-    def noted(self, line, function, *args):
-        tried.extend(args[4:])
-        return ask(self, line, function, *args)
+    def noted(self, call):
+        tried.extend(call.args[4:])
+        return ask(self, call)
 
-    monkeypatch.setattr(module.Alerts, "_ask", noted)
+    monkeypatch.setattr(module._Sender, "ask", noted)
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml", "json://127.0.0.1:9/closed"))
     hub, clock = Hub(), WallClock()
     async with alerting("lab", config, hub, clock):
@@ -153,7 +153,7 @@ def test_what_is_said_is_text_also_for_a_receiver_of_html(receiver, tmp_path: Pa
     """As a mail is: a prompt, a name or a reason may be anybody's."""
     secrets = receiver.secrets(tmp_path / "s.yaml")
     secrets.write_text(secrets.read_text().replace("/TOKEN", "/TOKEN?format=html"))
-    assert deliver(secrets, "lab: <b>", "<script>alert(1)</script>", 60.0) == []
+    assert deliver(secrets, 60.0, "lab: <b>", "<script>alert(1)</script>") == []
     ((_, text),) = receiver.messages
     assert "<script" not in text
     assert "&lt;script" in text
@@ -163,7 +163,7 @@ def test_what_is_said_is_text_also_for_a_receiver_of_html(receiver, tmp_path: Pa
 def test_each_receiver_has_its_own_sentence(receiver, tmp_path: Path, caplog, capfd):
     closed = "json://127.0.0.1:9/TOKEN"
     secrets = receiver.secrets(tmp_path / "s.yaml", closed, "nonsense TOKEN", "noscheme://TOKEN")
-    failures = deliver(secrets, "title", "text", 60.0)
+    failures = deliver(secrets, 60.0, "title", "text")
     assert receiver.messages == [("title", "text")]
     assert [(number, text.partition(")")[0]) for number, text in failures] == [
         (2, "receiver 2 of 4 (json"),
@@ -172,8 +172,8 @@ def test_each_receiver_has_its_own_sentence(receiver, tmp_path: Path, caplog, ca
     ]
     assert "TOKEN" not in caplog.text + "".join(capfd.readouterr())
     receiver.let_go.clear()
-    assert "receiver 1 of 4 (json)" in deliver(secrets, "title", "text", 0.3)[0][1]
-    assert ping(secrets, 0.3).startswith("alive_url ")
+    assert "receiver 1 of 4 (json)" in deliver(secrets, 0.3, "title", "text")[0][1]
+    assert ping(secrets, 0.3)[0][1].startswith("alive_url ")
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o700 | 0o001])
@@ -228,7 +228,7 @@ def test_alert_test_tells_who_was_reached(receiver, tmp_path: Path):
     assert "TOKEN" not in result.output
     result = ask.invoke(app, ["alert", "test", "--config", str(config_with(tmp_path, None))])
     assert result.exit_code == 2
-    assert "has no alerts.secrets" in result.stderr
+    assert "alerts.secrets" in result.stderr
 
 
 async def test_a_run_whose_stand_does_not_answer_is_reported(receiver, tmp_path: Path):

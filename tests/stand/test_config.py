@@ -25,7 +25,7 @@ def changed(tmp_path: Path, path: str, value: object, accept: list[str] | None =
     section = data
     *parents, last = path.split(".")
     for parent in parents:
-        section = section[parent]
+        section = section.setdefault(parent, {})
     section[last] = value
     file = tmp_path / "changed.yaml"
     file.write_text(yaml.dump(data, Dumper=QUICK_DUMPER))
@@ -84,9 +84,9 @@ def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
         ("guard.heater_off.rise_K", 0, "guard.heater_off.rise_K: must be greater than 0"),
         ("guard.sensors.warn_K", 7, "guard.sensors: warn_K 7.0 is above trip_K 6.0"),
         ("guard.keys_s", 9, "guard.keys_s must be at least twice the poll of regulator and relays (5.0 s)"),
-        ("guard.notify", "mail", "guard.notify: give a list: each entry behind a dash"),
-        ("guard.notify", ["mail", ""], "guard.notify.2: must have at least 1 character"),
-        ("guard.notify_limit_s", 61, "guard.notify_limit_s: must be less than or equal to 60"),
+        ("alerts.command", "mail", "alerts.command: give a list: each entry behind a dash"),
+        ("alerts.command", ["mail", ""], "alerts.command.2: must have at least 1 character"),
+        ("alerts.command_limit_s", 61, "alerts.command_limit_s: must be less than or equal to 60"),
         ("compressor.state_file", "a\nb", "compressor.state_file: expected a path of printable characters"),
         ("thermometers.air.plausible_degC", [50, -40], "air.plausible_degC: (50.0, -40.0) is not in asc"),
         ("thermometers.air.offset_K", -40, "air.offset_K: must be greater than or equal to -10"),

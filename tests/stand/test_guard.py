@@ -1,23 +1,28 @@
 """What the guard does when a rule objects; the rules and the stand's wires have tests of their own."""
 
 import asyncio
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 
-from tests.stand.guard_bench import NOTIFIERS, Bench, NotedFile
+from tests.stand.guard_bench import Bench, NotedFile
 from thermostand.foundation.clock import VirtualClock, WallClock, block_until, seconds_ns
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading
 from thermostand.stand.fault import Fault
 
 
-@pytest.fixture(autouse=True)
-def _ended_notifiers() -> Iterator[None]:
-    yield
-    while NOTIFIERS:
-        NOTIFIERS.pop().close()
+async def test_a_guard_that_fails_aborts_and_makes_safe():
+    bench = Bench("hold")
+    bench.broken = KeyError("channel")
+    time = asyncio.create_task(bench.clock.run())
+    with pytest.raises(KeyError):
+        await bench.guard.run()
+    await bench.safety.tried()
+    time.cancel()
+    assert bench.log == ["stop guard_failed", "revoke", "safe"]
+    text = "the guard failed (KeyError: 'channel')"
+    assert [(event.level, event.kind, event.text) for event in bench.events] == [("error", "guard.guard_failed", text)]
 
 
 async def test_permits_may_be_renewed_while_every_rule_holds_and_the_guard_looks():

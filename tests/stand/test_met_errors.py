@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.stand.guard_bench import NOTIFIERS, Bench
+from tests.stand.guard_bench import Bench
 from thermostand.foundation.errors import (
     DeviceAlarm,
     DeviceError,
@@ -41,7 +41,6 @@ def bench_of(*actions: str) -> Bench:
     bench.guard.met = met
     bench.guard.watches = (*bench.guard.watches, *met.watches)
     bench.hub.subscribe(met)
-    NOTIFIERS.pop().close()
     return bench
 
 

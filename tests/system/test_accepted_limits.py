@@ -52,14 +52,13 @@ def test_a_weakened_limit_is_refused_and_when_accepted_by_name_shown_at_each_sta
     assert reported == [("warning", {"compressor.min_off_s": 60.0})]
 
 
-def test_a_notify_program_that_does_not_exist_is_refused_where_a_run_would_begin_but_not_in_a_plan(
+def test_an_alert_program_that_does_not_exist_is_refused_where_a_run_would_begin_but_not_in_a_plan(
     tmp_path: Path, stand: Callable[..., Result]
 ):
-    notify = {"notify": [str(tmp_path / "tell"), "--urgent"]}
-    assert stand("plan", guard=notify).exit_code == 0
-    for options in ([], ["--virtual-time"]):
-        refused = stand("run", "--out", str(tmp_path / "sessions"), *options, guard=notify)
-        assert refused.exit_code == 2
-        assert f"guard.notify: {tmp_path / 'tell'} is no program" in refused.stderr
-        assert len(refused.stderr.splitlines()) == 1
-        assert not (tmp_path / "sessions").exists()
+    alerts = {"command": [str(tmp_path / "tell"), "--urgent"]}
+    assert stand("plan", alerts=alerts).exit_code == 0
+    refused = stand("run", "--out", str(tmp_path / "sessions"), alerts=alerts)
+    assert refused.exit_code == 2
+    assert f"alerts.command: {tmp_path / 'tell'} is no program" in refused.stderr
+    assert len(refused.stderr.splitlines()) == 1
+    assert not (tmp_path / "sessions").exists()

@@ -1,5 +1,5 @@
-"""The guard in whole runs, over every wire in virtual time: a trip is latched, made safe, recorded, noted and sent, and
-only an operator clears it."""
+"""The guard in whole runs, over every wire in virtual time: a trip is latched, made safe, recorded and noted, and only
+an operator clears it."""
 
 import asyncio
 import os
@@ -22,6 +22,7 @@ from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.recording.reading.session import Session
+from thermostand.stand.config.alerts_section import AlertsConfig
 from thermostand.stand.running.memory.entries import Cleared, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
@@ -80,9 +81,9 @@ class Watcher:
 
 
 def telling(order: Order, path: Path) -> Order:
-    """The same, and every trip is written to `path`."""
-    guard = order.config.guard.model_copy(update={"notify": ("/bin/sh", "-c", TELL, str(path))})
-    return replace(order, config=order.config.model_copy(update={"guard": guard}))
+    """The same, and every alert of its command is written to `path`."""
+    alerts = AlertsConfig(command=("/bin/sh", "-c", TELL, str(path)), grace_s=0)
+    return replace(order, config=order.config.model_copy(update={"alerts": alerts}))
 
 
 def trips_of(directory: Path) -> list[str]:
@@ -130,8 +131,8 @@ def once_warm(action: Callable[[], object]) -> Callable[[Hub], None]:
 async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_operator_may_resume_it(
     tmp_path: Path, order: Callable[..., Order], name: str, value: object, rule: str, text: str
 ):
-    reported, tasks = tmp_path / "reported", list[asyncio.Task[None]]()
-    ordered = telling(order(LONG_SOAK, bus={"timeout_s": 0.1}), reported)
+    tasks = list[asyncio.Task[None]]()
+    ordered = order(LONG_SOAK, bus={"timeout_s": 0.1})
     begins = once_warm if name == "heater.cut_out" else partial(at_step, "soak")  # the first heat has its own rule
     watch = begins(lambda: tasks.append(asyncio.create_task(fault(ordered, name, value))))
     with pytest.raises(StandTripped) as caught:
@@ -145,7 +146,6 @@ async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_opera
     assert (trip.level, trip.kind) == ("error", f"guard.{rule}")
     assert text in trip.text
     assert str(caught.value) == f"{trip.text}; the stand is safe"
-    assert reported.read_text() == f"{trip.text}\n"
     assert trips_of(directory) == [rule]
     if name != "thermometers.silent":
         check_safe(session)
@@ -192,8 +192,8 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
 ):
     """It holds, stays held when its cause is gone, and is cleared over the socket."""
     rule, breaks, mends = TO_BE_PUT_RIGHT[name]
-    reported, out, watcher = tmp_path / "reported", tmp_path / "out", Watcher()
-    ordered = telling(order(LONG_SOAK), reported)
+    out, watcher = tmp_path / "out", Watcher()
+    ordered = order(LONG_SOAK)
 
     async def do(what: object, value: object) -> None:
         if isinstance(what, str):
@@ -230,7 +230,6 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
     check_safe(session)
     trips = [event for event in session.events() if event.kind.startswith("guard.") and event.level == "error"]
     assert [trip.kind for trip in trips] == [f"guard.{rule}"] * (2 if rule == "stage_alarm" else 1)
-    assert reported.read_text().splitlines() == [trip.text for trip in trips]
     assert [entry for entry in trips_of(directory) if entry != "cleared"] == [rule] * len(trips)
     assert trips_of(directory).count("cleared") == len(trips)
 
@@ -238,7 +237,7 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
 async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_room(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    ordered, watcher, out = telling(order(LONG_SOAK), tmp_path / "reported"), Watcher(), tmp_path / "out"
+    ordered, watcher, out = order(LONG_SOAK), Watcher(), tmp_path / "out"
     recording = ordered.config.recording.model_copy(update={"stop_frames_below_GB": 1e9})
     ordered = replace(ordered, config=ordered.config.model_copy(update={"recording": recording}))
 
@@ -252,7 +251,6 @@ async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_ro
         await asyncio.to_thread(ask, directory, "stop")
 
     await run_operated(ordered, out, watcher, operate())
-    assert len((tmp_path / "reported").read_text().splitlines()) == 2
 
 
 async def test_a_terminal_that_is_closed_leaves_the_stand_safe(tmp_path: Path, order: Callable[..., Order]):

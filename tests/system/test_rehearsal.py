@@ -19,7 +19,7 @@ def real_stand(folder: Path, **changes: object) -> Path:
     """The installed laboratory's file with a few things that only this one has, and no camera."""
     data = yaml.safe_load(packaged("", "laboratory").read_text())
     data["limits"]["chamber_degC"] = [12, 48]
-    data["guard"]["notify"] = ["/bin/true"]
+    data["alerts"] = {"command": ["/bin/true"]}
     data |= {"cameras": {}, **changes}
     (folder / "stand.yaml").write_text(yaml.safe_dump(data))
     (folder / "short.yaml").write_text(RECIPE)
@@ -53,7 +53,7 @@ def test_what_is_kept_and_what_is_replaced(tmp_path: Path):
     assert own.camera is not None
     assert (there.camera.exposure_s, there.camera.serial_number) == (own.camera.exposure_s, own.camera.serial_number)
     assert there.bus.address.startswith("tcp:127.0.0.1")
-    assert (there.guard.notify, there.compressor.state_file) == ((), None)
+    assert (there.alerts.command, there.compressor.state_file) == ((), None)
     assert rehearsed(found) == found
 
 

@@ -54,11 +54,11 @@ def stopped(kind: str = "soak") -> Callable[..., None]:
 def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_said_and_recorded(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    """The resumed run trips, of which the session's notify program would be notified; then it is resumed to its end."""
+    """The resumed run trips, of which the session's alert program would be told; then it is resumed to its end."""
     trace, state, tasks = tmp_path / "was-run", tmp_path / "compressor.json", list[asyncio.Task[None]]()
     hostile = order(
         CAPTURES,
-        guard={"notify": ["/bin/sh", "-c", f"touch {trace}"]},
+        alerts={"command": ["/bin/sh", "-c", f"touch {trace}"]},
         compressor={"state_file": str(state)},
     )
     with pytest.raises(Interrupted):
@@ -77,12 +77,12 @@ def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_sai
     assert resumed.exit_code == 0, resumed.output
     said = [line for line in resumed.stderr.splitlines() if "as on this stand" in line]
     assert len(said) == 2
-    assert 'not ["/bin/sh", "-c"' in said[0]
-    assert "compressor.state_file is not given" in said[1]
+    assert "compressor.state_file is not given" in said[0]
+    assert 'not ["/bin/sh", "-c"' in said[1]
     session = Session.open(directory)
     recorded = [event.data for event in session.events() if event.kind == "stand_differs"]
-    assert [data["path"] for data in recorded] == ["guard.notify", "compressor.state_file"] * 2
-    assert recorded[0]["stand"] == []
+    assert [data["path"] for data in recorded] == ["compressor.state_file", "alerts.command"] * 2
+    assert recorded[1]["stand"] == []
     assert session.frame_count == 2
     assert not trace.exists()
 
@@ -126,7 +126,8 @@ def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp
         flap={"backend": "somebodys.module", "backend_address": "tcp:192.168.1.99:1"},
         camera={"exposure_s": 0.2, "address": "192.168.1.98", "temperature": {"entry": "Mainboard"}},
         recording={"directory": "/somewhere", "frame_encoding": "raw"},
-        guard={"notify": ["/bin/rm", "-r", "/"], "max_camera_degC": 99.0},
+        guard={"max_camera_degC": 99.0},
+        alerts={"command": ["/bin/rm", "-r", "/"]},
         limits={"chamber_degC": [-10, 59]},
         compressor={"state_file": "/etc/passwd", "min_off_s": 181},
     )

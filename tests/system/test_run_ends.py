@@ -9,26 +9,28 @@ import socket
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
+from typing import get_args
 
 import pytest
 
 from tests.installed import install
 from tests.system.conftest import SHORT_RECIPE
 from tests.system.resume_process import Daemon
-from tests.system.test_guard_run import telling
 from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, ignore
 from thermostand.foundation import calls
 from thermostand.foundation.errors import NotCleared, StandTripped
-from thermostand.foundation.items import Item, StepMark, StepState
+from thermostand.foundation.events import AlertCause
+from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import Interrupted, run_real, run_virtual
+from thermostand.stand.serving.alerts import AlertBook, AlertMessage
 from thermostand.stand.simulator import Simulator
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
@@ -59,22 +61,31 @@ async def test_a_session_says_which_package_has_made_steps_of_its_plan(
     assert start.data["packages"] == ["acme 1.2"]
 
 
-async def test_somebody_is_notified_of_a_step_that_fails_and_of_the_run_that_ends_because_nobody_came(
+def messages(events: Sequence[Event]) -> list[AlertMessage]:
+    """What receivers of all causes get of a night's events."""
+    book = AlertBook("lab", get_args(AlertCause), 0, 1000)
+    return [each for event in events for each in (*book.receive(event, event.time_ns), *book.due(event.time_ns))]
+
+
+async def test_people_are_alerted_of_a_step_that_fails_and_of_the_run_that_ends_because_nobody_came(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    reported, ordered = tmp_path / "reported", order(SHORTER)
+    ordered = order(SHORTER)
     watch = at_step("soak", lambda: break_now(ordered, "flap.jam", 500))
-    with pytest.raises(NotCleared) as caught:
-        await run_virtual(telling(ordered, reported), tmp_path / "out", None, watch)
+    with pytest.raises(NotCleared):
+        await run_virtual(ordered, tmp_path / "out", None, watch)
     (directory,) = (tmp_path / "out").iterdir()
-    (trip,) = [event for event in Session.open(directory).events() if event.kind == "guard.device_fault"]
-    assert reported.read_text().splitlines() == [trip.text, f"{directory.name} has failed: {caught.value}"]
+    events = Session.open(directory).events()
+    (trip,) = [event for event in events if event.kind == "guard.device_fault"]
+    found = messages(events)
+    assert trip.text in [message.text for message in found if message.cause == "hold"]
+    assert found[-1].cause == "run_aborted"
 
 
 async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_complete_run(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    reported, ordered = tmp_path / "reported", order(SHORTER, bus={"timeout_s": 0.05}, guard={"safe_limit_s": 2})
+    ordered = order(SHORTER, bus={"timeout_s": 0.05}, guard={"safe_limit_s": 2})
     last = list(ordered.recipe.plan())[-1].step_id
 
     def follow(item: Item) -> None:
@@ -82,17 +93,9 @@ async def test_a_stand_that_is_not_confirmed_safe_after_the_last_step_is_no_comp
             break_now(ordered, "bus.silent", True)
 
     with pytest.raises(StandTripped, match=r"NOT SAFE: .*regulator did not confirm"):
-        await run_virtual(telling(ordered, reported), tmp_path / "out", None, lambda hub: hub.subscribe(follow))
-    (line,) = reported.read_text().splitlines()
-    assert line.count("NOT SAFE") == 1
-
-
-async def test_nobody_is_notified_of_a_run_that_the_operator_stopped(tmp_path: Path, order: Callable[..., Order]):
-    reported = tmp_path / "reported"
-    stop = at_step("soak", lambda: os.kill(os.getpid(), signal.SIGINT))
-    with pytest.raises(Interrupted):
-        await run_virtual(telling(order(SHORTER), reported), tmp_path / "out", None, stop)
-    assert not reported.exists()
+        await run_virtual(ordered, tmp_path / "out", None, lambda hub: hub.subscribe(follow))
+    (directory,) = (tmp_path / "out").iterdir()
+    assert "trip" in [message.cause for message in messages(Session.open(directory).events())]
 
 
 async def test_what_happened_before_the_recording_began_is_in_it(tmp_path: Path, order: Callable[..., Order]):

@@ -171,7 +171,6 @@ class OpenStand:
             await cancelled([*tasks, *(self._tasks if self.is_for_one else ())])
             if self.is_for_one:
                 await safety.close()
-            await self.guard.notified()
         for poller in self._pollers:
             await poller.poll()
 

@@ -84,7 +84,6 @@ def on_this_stand(
 
 def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
     simulated = own if own.simulation is not None else default_stand()
-    notified = {"notify": own.guard.notify, "notify_limit_s": own.guard.notify_limit_s}
     maps = {
         name: settings.model_copy(
             update={
@@ -100,7 +99,7 @@ def _in_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
     return recorded.model_copy(
         update={
             **recorded.sections_with(maps),
-            "guard": recorded.guard.model_copy(update=notified),
+            "alerts": own.alerts,
             "compressor": recorded.compressor.model_copy(update=state_file),
             "recording": recorded.recording.model_copy(update={"directory": own.recording.directory}),
             "flap": recorded.flap

@@ -1,6 +1,5 @@
-"""Somebody is notified whatever state the daemon is in, by a small process that goes with it."""
+"""An alert reaches the command whatever state the daemon is in, by a small process that goes with it."""
 
-import asyncio
 import os
 import signal
 import subprocess
@@ -11,35 +10,28 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.foundation.clock import WallClock
-from thermostand.stand.guarding.notify import Notifier
-
 LIMIT_S = 60.0  # for what takes milliseconds, on a machine that has other things to do
 
 
 class Daemon:
-    """It tells each sentence by a line in the file `reported`, after `nap_s`."""
+    """Each line that is sent becomes a line in the file `reported`, after `nap_s`."""
 
     def __init__(self, reported, nap_s=0.0):
         script = f'sleep {nap_s}; printf "%s\\n" "$1" >> "$0"'
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.system.notify_daemon", "/bin/sh", "-c", script, str(reported)],
+            [sys.executable, "-m", "tests.system.alert_daemon", "/bin/sh", "-c", script, str(reported)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.pid = int(self._line())
-
-    def tell(self, text):
-        """What became of it."""
-        self.send(text)
-        return self._line()
+        self.pid = int(self.line())
 
     def send(self, text):
         self.process.stdin.write(f"{text}\n")
         self.process.stdin.flush()
 
-    def _line(self):
+    def line(self):
+        """What it says: the process that sends, then what was not delivered."""
         watchdog = threading.Timer(LIMIT_S, self.process.kill)
         watchdog.start()
         try:
@@ -73,35 +65,31 @@ def gone(pid):
     return not command.exists() or command.read_bytes() == b""
 
 
-def test_a_daemon_that_has_no_descriptor_left_still_tells(daemon, tmp_path):
-    assert daemon.tell("too warm!") == ""
-    assert (tmp_path / "reported").read_text() == "too warm!\n"
+def reported(folder):
+    path = folder / "reported"
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def test_a_daemon_that_has_no_descriptor_left_still_alerts(daemon, tmp_path):
+    daemon.send("too warm!")
+    until(lambda: reported(tmp_path))
+    assert reported(tmp_path)[0].endswith(": too warm!")
 
 
 def test_a_process_that_was_killed_is_replaced_when_something_is_to_be_reported(daemon, tmp_path):
     os.kill(daemon.pid, signal.SIGKILL)
-    assert daemon.tell("too warm") == ""
-    assert (tmp_path / "reported").read_text() == "too warm\n"
+    daemon.send("too warm")
+    until(lambda: reported(tmp_path))
+    assert reported(tmp_path)[0].endswith(": too warm")
 
 
-def test_a_process_that_cannot_be_replaced_is_a_sentence_and_tried_again_the_next_time(daemon, tmp_path):
+def test_a_process_that_cannot_be_replaced_is_an_event_and_tried_again_with_the_next_message(daemon, tmp_path):
     os.kill(daemon.pid, signal.SIGKILL)
-    assert "/bin/sh could not" in daemon.tell("too warm!")
-    assert daemon.tell("too cold") == ""
-    assert (tmp_path / "reported").read_text() == "too cold\n"
-
-
-async def test_a_slow_command_delays_no_other(tmp_path):
-    """The first two end only when the third has reported."""
-    script = 'case "$1" in slow*) until [ -e "$0" ]; do sleep 0.05; done;; *) : > "$0";; esac'
-    notifier = Notifier(("/bin/sh", "-c", script, str(tmp_path / "third")), LIMIT_S, WallClock())
-    try:
-        slow = [asyncio.create_task(notifier.tell(text)) for text in ("slow 1", "slow 2")]
-        await asyncio.sleep(0)
-        assert await notifier.tell("third") == ""
-        assert await asyncio.gather(*slow) == ["", ""]
-    finally:
-        notifier.close()
+    daemon.send("too warm!")
+    assert daemon.line() != ""
+    daemon.send("too cold")
+    until(lambda: reported(tmp_path))
+    assert reported(tmp_path)[0].endswith(": too cold")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
@@ -112,7 +100,7 @@ def test_the_process_ends_with_its_daemon_and_what_was_under_way_is_reported(tmp
     daemon.process.send_signal(number)
     daemon.process.wait(LIMIT_S)
     until(lambda: gone(daemon.pid))
-    assert (tmp_path / "reported").read_text() == "too warm\n"
+    assert reported(tmp_path)[0].endswith(": too warm")
     daemon.close()
 
 
