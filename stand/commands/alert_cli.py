@@ -38,7 +38,7 @@ def try_them(config: ConfigOption = "simulated") -> None:
     if alerts.secrets is None and not alerts.command:
         raise ConfigError(
             f"{config}: has neither alerts.secrets nor alerts.command; name a file with `urls:`, or a program "
-            "(docs/how-to/get-alerts.md)"
+            "(docs/explanation/safety.md)"
         )
     check_alerts(alerts)
     found = AlertSecrets() if alerts.secrets is None else load_secrets(alerts.secrets)
