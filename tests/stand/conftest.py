@@ -1,11 +1,16 @@
-"""The browser and the night behind the page, for the files that look at it."""
+"""The browser and the night behind the page, and the session that commands are asked about."""
 
+import asyncio
+import shutil
 from pathlib import Path
 
+import pytest
 import pytest_asyncio
 
+from tests.recording.recorded import record
 from tests.stand.browser import browser
 from tests.stand.page_desk import a_night, free_port
+from tests.stand.session_commands import COUNT
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -21,3 +26,17 @@ async def night(tmp_path: Path, chromium):
     async with a_night(tmp_path / "sessions", port) as desk:
         desk.port, desk.chromium = port, chromium
         yield desk
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six seconds of a night in a folder of sessions; not to be changed."""
+    directory = tmp_path_factory.mktemp("sessions") / "20260101T180000Z-thermal_cycle"
+    asyncio.run(record(directory, COUNT))
+    return directory
+
+
+@pytest.fixture
+def session(whole: Path, tmp_path: Path) -> Path:
+    """A copy of it that a test may spoil."""
+    return Path(shutil.copytree(whole, tmp_path / "sessions" / whole.name))

@@ -2,7 +2,7 @@
 while it is led. Each action takes a second; what is not allowed is noted in `wrong`."""
 
 import asyncio
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -165,14 +165,16 @@ class SmallStand:
 class Life:
     """One daemon, from its start to its death; what it leaves is in `folder`, and what it recorded in `disk`. decides:
     makes the plan's decisions, in a process of its own. follows: the chamber is always at its set-point, and says
-    so. gap: that after which it is begun. meet: gets a device error that a step has met."""
+    so. gap: that after which it is begun. meet: gets a device error that a step has met. What it publishes is in
+    `reported`."""
 
     def __init__(
         self, folder: Path, plan, start_ns, disk, chamber_degC, decides=None, *, follows=False, gap=None, meet=unguarded
     ):
         self.loop = asyncio.new_event_loop()
         self.wrong = []
-        self.hub, self.clock = Hub(), VirtualClock(start_ns)
+        self.hub, self.clock, self.reported = Hub(), VirtualClock(start_ns), []
+        self.hub.subscribe(self.reported.append)
         self._decider = Decider(folder, self.clock, decides).decide if decides else fixed_plan
         self.stop = Stop()
         self.stand = SmallStand(self.clock, self.hub, self.wrong)
@@ -335,3 +337,18 @@ class Life:
             self.begun += item.state is StepState.STARTED
         if isinstance(item, StepMark | Frame | Event):
             self._unsaved.append(item)
+
+
+@contextmanager
+def lives(folder, plan, start_ns, decides=None):
+    """begin(start_ns, plan): a daemon that runs the plan, or goes on with it; the last one is ended at the end."""
+    begun, disk = [], []
+
+    def begin(start_ns=start_ns, plan=plan):
+        begun.append(Life(folder, plan, start_ns, disk, 24.0, decides, follows=True))
+        return begun[-1]
+
+    yield begin
+    if not begun[-1].loop.is_closed():
+        begun[-1].kill()
+    assert not any(each.wrong for each in begun)

@@ -117,11 +117,9 @@ def test_it_is_performed_recorded_and_restored_after_a_hold(tmp_path: Path):
     plan = tuple(number_steps([StartChamber(24.0), step_of("lamp_on", {"percent": 40.0}), Soak(60.0, band_K=0.0)]))
     (tmp_path / "life").mkdir()
     life = Life(tmp_path / "life", plan, START_NS, [], 24.0, follows=True)
-    reported: list[object] = []
-    life.hub.subscribe(reported.append)
     try:
         life.passes(10.0)
-        marks = [item for item in reported if isinstance(item, StepMark) and item.kind == "lamp_on"]
+        marks = [item for item in life.reported if isinstance(item, StepMark) and item.kind == "lamp_on"]
         assert [(mark.state, mark.parameters) for mark in marks] == [
             ("started", {"percent": 40.0}),
             ("done", {"percent": 40.0}),
@@ -132,7 +130,7 @@ def test_it_is_performed_recorded_and_restored_after_a_hold(tmp_path: Path):
     finally:
         life.kill()
     assert sys.modules["acme_lamp"].PERFORMED == [40.0, 40.0]
-    restored = [item.text for item in reported if isinstance(item, Event) and item.kind == "restored"]
+    restored = [item.text for item in life.reported if isinstance(item, Event) and item.kind == "restored"]
     assert [text.rpartition(", ")[2] for text in restored] == ["lamp at 40 %"]
 
 

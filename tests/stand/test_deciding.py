@@ -12,7 +12,7 @@ import pytest
 
 from tests.journals import read_lines
 from tests.stand.decisions_process import ANSWERS, ASKED, decided
-from tests.stand.small_stand import Life
+from tests.stand.small_stand import Life, lives
 from thermostand.experiments.known import Enough, Undecided, Visit, after_decision, fixed_visits
 from thermostand.experiments.parameters import Known
 from thermostand.experiments.steps import (
@@ -55,22 +55,14 @@ def visit(chamber_degC: float, dwell_s: float) -> dict[str, object]:
 @pytest.fixture
 def life(tmp_path: Path):
     """begin(answers): a daemon that runs PLAN, or resumes it; the last one is ended with the test."""
-    lives: list[Life] = []
-    disk: list[object] = []
+    with lives(tmp_path, PLAN, START_NS, decided) as begin_life:
 
-    def begin(*answers: object, start_ns: int = START_NS) -> Life:
-        if answers:
-            (tmp_path / ANSWERS).write_text(json.dumps(answers))
-        begun = Life(tmp_path, PLAN, start_ns, disk, 24.0, decided, follows=True)
-        begun.reported = []
-        begun.hub.subscribe(begun.reported.append)
-        lives.append(begun)
-        return begun
+        def begin(*answers: object, start_ns: int = START_NS) -> Life:
+            if answers:
+                (tmp_path / ANSWERS).write_text(json.dumps(answers))
+            return begin_life(start_ns)
 
-    yield begin
-    if not lives[-1].loop.is_closed():
-        lives[-1].kill()
-    assert not any(each.wrong for each in lives)
+        yield begin
 
 
 def captured(plan: tuple[PlannedStep, ...]) -> list[tuple[float, Role]]:

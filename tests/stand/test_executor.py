@@ -52,8 +52,7 @@ class Here:
 
     def __init__(self, folder: Path, **options: Any) -> None:
         self.life = Life(folder, PLAN, START_NS, list[object](), 24.0, **options)
-        self.items: list[Item] = []
-        self.life.hub.subscribe(self.items.append)
+        self.items: list[Item] = self.life.reported
 
     def passes_until(self, kind: str, late_s: float = 0.0) -> None:
         """Until a step of that kind is under way, and so much longer."""

@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from tests.journals import lines_with, read_lines
-from tests.stand.small_stand import Life
+from tests.stand.small_stand import Life, lives
 from thermostand.experiments.steps import (
     Capture,
     CheckHome,
@@ -59,21 +59,8 @@ START_NS = 1_767_290_400 * NS_PER_S
 
 @pytest.fixture
 def life(tmp_path: Path):
-    """begin(): a daemon that runs PLAN, or goes on with it; the last one is ended with the test."""
-    lives: list[Life] = []
-    disk: list[object] = []
-
-    def begin(start_ns: int = START_NS, plan=PLAN) -> Life:
-        begun = Life(tmp_path, plan, start_ns, disk, 24.0, follows=True)
-        begun.reported = []
-        begun.hub.subscribe(begun.reported.append)
-        lives.append(begun)
-        return begun
-
-    yield begin
-    if not lives[-1].loop.is_closed():
-        lives[-1].kill()
-    assert not any(each.wrong for each in lives)
+    with lives(tmp_path, PLAN, START_NS) as begin:
+        yield begin
 
 
 def passes_until(life: Life, kind: str, late_s: float = 0.0) -> None:

@@ -16,19 +16,6 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.sessions.session_table import fitting, lines
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six seconds of a night in a folder of sessions; not to be changed."""
-    directory = tmp_path_factory.mktemp("sessions") / "20260101T180000Z-thermal_cycle"
-    asyncio.run(record(directory, COUNT))
-    return directory
-
-
-@pytest.fixture
-def session(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "sessions" / whole.name))
-
-
 def flip_in_frame(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[frame_places(path)[1].chunk.offset + 150] ^= 1

@@ -1,28 +1,12 @@
 """What the commands on sessions refuse, and how they say it."""
 
-import asyncio
 import fcntl
 import os
-import shutil
 from pathlib import Path
 
 import pytest
 
-from tests.recording.recorded import record
-from tests.stand.session_commands import COUNT, ask, refused
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six seconds of a night in a folder of sessions; not to be changed."""
-    directory = tmp_path_factory.mktemp("sessions") / "20260101T180000Z-thermal_cycle"
-    asyncio.run(record(directory, COUNT))
-    return directory
-
-
-@pytest.fixture
-def session(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "sessions" / whole.name))
+from tests.stand.session_commands import ask, refused
 
 
 @pytest.mark.parametrize("command", ["info", "verify", "replay", "salvage"])

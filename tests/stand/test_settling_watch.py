@@ -38,8 +38,6 @@ def life(tmp_path: Path, image: np.ndarray):
     def begin(chamber_degC: float = 24.0, start_ns: int = START_NS) -> Life:
         begun = Life(tmp_path, PLAN, start_ns, disk, chamber_degC)
         begun.stand.image = image
-        begun.reported = []
-        begun.hub.subscribe(begun.reported.append)
         begun.pv_degC = chamber_degC
         begun.call(lambda: setattr(begun, "polling", asyncio.create_task(poll(begun))))
         lives.append(begun)

@@ -4,27 +4,21 @@ import asyncio
 import socket
 import threading
 import time
-from collections.abc import AsyncGenerator, Callable, Iterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import cast
 
 import pytest
 import yaml
 
 from tests.stand.alert_receiver import Receiver
-from thermostand.foundation.clock import WallClock
-from thermostand.foundation.hub import Hub
+from tests.system.daemon_here import DaemonHere, served_here, until
 from thermostand.foundation.items import Event
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.service.daemon import Daemon
-from thermostand.stand.service.serve import serve as serve_stand
-from thermostand.stand.service.stand_service import StandService
+from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.serving.api.doors import Interface
 from thermostand.stand.serving.api.server import serve as serve_clients
 from thermostand.stand.serving.client import server_of
 
-LIMIT_S = 120.0  # for a busy machine
 WATCHDOG_S = 1.5
 
 
@@ -51,8 +45,7 @@ async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
     data = yaml.safe_load(laboratory.read_text())
     data["alerts"] = {"secrets": str(hung.secrets(tmp_path / "secrets.yaml")), "alive_every_s": 1, "grace_s": 0}
     laboratory.write_text(yaml.safe_dump(data))
-    config, out = load_config(laboratory), tmp_path / "out"
-    texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    out = tmp_path / "out"
     manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     manager.bind(str(tmp_path / "notify"))
     manager.setblocking(False)
@@ -60,44 +53,31 @@ async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
     monkeypatch.setenv("WATCHDOG_USEC", str(round(WATCHDOG_S * 1e6)))
     late: list[str] = []
 
-    @asynccontextmanager
-    async def front(desk: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
-        daemon = cast("Daemon", desk.host)
+    async def work(here: DaemonHere) -> None:
+        hub, clock, daemon = here.hub, here.clock, here.daemon
+        await until(lambda: bool(hung.calls))  # the sign of life hangs
+        for _ in range(20):
+            hub.publish(Event(clock.now_ns(), "error", "device_lost", "a device does not answer", {"device": "x"}))
+        fed(manager)
+        end_s = time.monotonic() + 3 * WATCHDOG_S
+        while time.monotonic() < end_s:
+            began_s = time.monotonic()
+            await asyncio.to_thread(server_of(out).state, 20.0)
+            if (took_s := time.monotonic() - began_s) > 2.0 or not daemon.open_stand.guard.is_on_time:
+                late.append(f"{took_s:.1f} s")
+            await asyncio.sleep(0.1)
+        assert fed(manager) >= 3
+        fed(manager)
+        threading.Event().wait(WATCHDOG_S)  # the event loop is blocked: nobody feeds from beside it
+        assert fed(manager) == 0
+        monkeypatch.setattr(type(daemon.open_stand.guard), "is_on_time", property(lambda _: False))
+        await asyncio.sleep(0.2)
+        fed(manager)
+        await asyncio.sleep(WATCHDOG_S)
+        assert fed(manager) == 0  # the service manager will end a daemon whose guard does not look
 
-        async def until(wanted: Callable[[], bool]) -> None:
-            async with asyncio.timeout(LIMIT_S):
-                while not wanted():
-                    await asyncio.sleep(0.02)
-
-        async def work() -> None:
-            await until(lambda: bool(hung.calls))  # the sign of life hangs
-            for _ in range(20):
-                hub.publish(Event(clock.now_ns(), "error", "device_lost", "a device does not answer", {"device": "x"}))
-            fed(manager)
-            end_s = time.monotonic() + 3 * WATCHDOG_S
-            while time.monotonic() < end_s:
-                began_s = time.monotonic()
-                await asyncio.to_thread(server_of(out).state, 20.0)
-                if (took_s := time.monotonic() - began_s) > 2.0 or not daemon.open_stand.guard.is_on_time:
-                    late.append(f"{took_s:.1f} s")
-                await asyncio.sleep(0.1)
-            assert fed(manager) >= 3
-            fed(manager)
-            threading.Event().wait(WATCHDOG_S)  # the event loop is blocked: nobody feeds from beside it
-            assert fed(manager) == 0
-            monkeypatch.setattr(type(daemon.open_stand.guard), "is_on_time", property(lambda _: False))
-            await asyncio.sleep(0.2)
-            fed(manager)
-            await asyncio.sleep(WATCHDOG_S)
-            assert fed(manager) == 0  # the service manager will end a daemon whose guard does not look
-
-        async with serve_clients(desk, out, config.name, Interface(out)):
-            working = asyncio.create_task(work())
-            working.add_done_callback(lambda _: daemon.leave())
-            yield
-            await working
-
+    name = load_config(laboratory).name
     with manager:
-        await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
+        await served_here(laboratory, out, work, lambda desk: serve_clients(desk, out, name, Interface(out)))
     assert late == []
     assert hung.messages == []

@@ -1,33 +1,24 @@
 """Heat that an operator orders between runs: it goes on over midnight, and is told while the regulator is not read."""
 
-import asyncio
 import socket
-from collections.abc import AsyncGenerator, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import cast
 
 import pytest
 
-from tests.system.test_daemon import LIMIT_S
-from thermostand.foundation.clock import WallClock
-from thermostand.foundation.hub import Hub
+from tests.system.daemon_here import DaemonHere, served_here, until
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import bad_reading
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.service.daemon import Daemon
 from thermostand.stand.service.day_record import DayRecord
-from thermostand.stand.service.serve import serve as serve_stand
-from thermostand.stand.service.stand_service import DeviceRequest, StandService
+from thermostand.stand.service.stand_service import DeviceRequest
 from thermostand.stand.serving.desk import Who
 
 
 async def test_midnight_changes_the_record_beneath_heat_by_hand(
     laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
-    texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    out, who = tmp_path / "out", Who(name="a test", how="terminal")
     day = ["20261122"]
     monkeypatch.setattr(DayRecord, "_today", lambda _: day[0])
     reported: list[Event] = []
@@ -42,42 +33,29 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
                 told.extend(manager.recv(1000).splitlines())
         return told[-1:] == [line]
 
-    @asynccontextmanager
-    async def front(desk: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:
-        daemon = cast("Daemon", desk.host)
-
-        async def until(wanted: Callable[[], bool]) -> None:
-            async with asyncio.timeout(LIMIT_S):
-                while not wanted():
-                    await asyncio.sleep(0.02)
-
-        async def work() -> None:
-            hub.subscribe(lambda item: reported.append(item) if isinstance(item, Event) else None)
-            await desk.device(who, DeviceRequest(device="regulator", verb="set", arguments={"setpoint_degC": 40.0}))
-            await until(lambda: desk.state().heater_permitted)
-            day[0] = "20261123"
-            await until(lambda: daemon.record.is_of_today())
-            turned_ns = clock.now_ns()
-            await until(lambda: clock.now_ns() > turned_ns + 3_000_000_000)  # the guard looks each second
-            assert desk.state().heater_permitted
-            assert desk.state().fault is None
-            by_hand, now_ns = desk.state().by_hand, clock.now_ns()
-            hub.publish(Batch("regulator", now_ns, (bad_reading("regulator.running", "1", now_ns, "no answer"),)))
-            assert (desk.state().setpoint_degC, desk.state().by_hand) == (None, by_hand)  # its wire is gone
-            await until(lambda: desk.state().setpoint_degC == 40.0)
-            assert desk.state().by_hand == by_hand is not None
-            assert daemon.open_stand.recorder is daemon.record.recorder
-            await until(lambda: is_told(b"STATUS=heat by hand, set-point 40 degC"))
-            desk.stop(who)
-            await until(lambda: is_told(b"STATUS=idle"))
-
-        working = asyncio.create_task(work())
-        working.add_done_callback(lambda _: daemon.leave())
-        yield
-        await working
+    async def work(here: DaemonHere) -> None:
+        desk, hub, clock, daemon = here.desk, here.hub, here.clock, here.daemon
+        hub.subscribe(lambda item: reported.append(item) if isinstance(item, Event) else None)
+        await desk.device(who, DeviceRequest(device="regulator", verb="set", arguments={"setpoint_degC": 40.0}))
+        await until(lambda: desk.state().heater_permitted)
+        day[0] = "20261123"
+        await until(lambda: daemon.record.is_of_today())
+        turned_ns = clock.now_ns()
+        await until(lambda: clock.now_ns() > turned_ns + 3_000_000_000)  # the guard looks each second
+        assert desk.state().heater_permitted
+        assert desk.state().fault is None
+        by_hand, now_ns = desk.state().by_hand, clock.now_ns()
+        hub.publish(Batch("regulator", now_ns, (bad_reading("regulator.running", "1", now_ns, "no answer"),)))
+        assert (desk.state().setpoint_degC, desk.state().by_hand) == (None, by_hand)  # its wire is gone
+        await until(lambda: desk.state().setpoint_degC == 40.0)
+        assert desk.state().by_hand == by_hand is not None
+        assert daemon.open_stand.recorder is daemon.record.recorder
+        await until(lambda: is_told(b"STATUS=heat by hand, set-point 40 degC"))
+        desk.stop(who)
+        await until(lambda: is_told(b"STATUS=idle"))
 
     with manager:
-        await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
+        await served_here(laboratory, out, work)
     # On a busy machine a poll may take longer than its period.
     assert {event.kind for event in reported if event.level != "info"} <= {"device_slow"}
     first, second = (

@@ -2,21 +2,16 @@
 
 import asyncio
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from tests import forked
-from tests.system.virtual_stand import VirtualStand, virtual_stand
+from tests.system.virtual_stand import REAL_TIME, VirtualStand, heating_process, virtual_stand
 from thermostand.foundation.errors import DeviceFault
 from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
-LIMIT_S = 60.0  # real
 MODULE = {"registers": "icpdas-m7024", "unit": 4, "channel": 2, "watchdog_s": 12.0}
 CHANNELS = {"heater_enable": 0, "compressor": 1, "camera_power": 2}
 
@@ -79,50 +74,14 @@ async def test_a_module_whose_watchdog_wants_another_protocol_is_refused_before_
             pass
 
 
-RECIPE = "name: soak\nexperiments:\n  - steps:\n      - start_chamber: 45\n      - soak: 100000\n"
-FAST: dict[str, dict[str, object]] = {
-    "regulator": {"poll_s": 0.25, "sample_s": 0.25},
-    "heat_module": {"watchdog_s": 1.5},
-    "thermometer_module": {"poll_s": 0.25},
-    "relays": {"poll_s": 0.5, "self_test_s": 0.6},
-    "flap": {"poll_s": 0.5},
-    "guard": {"period_s": 0.5, "heater_hold_s": 30.0, "heater_renew_s": 5.0},
-    "recording": {"telemetry_commit_s": 0.2},
-}
-
-
 async def test_a_process_that_is_killed_leaves_the_module_at_its_safe_value_after_its_watchdogs_time(tmp_path: Path):
     """SIGKILL, in real time: the module ends the heat, long before the enable relay's hold of 30 s."""
-    path = stand_file(tmp_path, **FAST)
-    config = load_config(path)
-    simulator = await asyncio.to_thread(Simulator, laboratory_of(config, virtual=False, seed=None, is_anywhere=True))
-    control = ControlSocket(simulator.addresses["control"])
-    await control.open()
-
-    async def plant(quantity: str) -> float:
-        return float(str((await control.request({"do": "state"}))[quantity]))
-
-    data = yaml.safe_load(path.read_text())
-    data["bus"]["address"] = simulator.addresses["bus"]
-    data["flap"]["backend_address"] = simulator.addresses["flap"]
-    data["simulation"]["control"] = simulator.addresses["control"]
-    path.write_text(yaml.safe_dump(data))
-    (tmp_path / "recipe.yaml").write_text(RECIPE)
-    run = ["run", tmp_path / "recipe.yaml", "--config", path, "--out", tmp_path / "out"]
-    process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
-    try:
-        async with asyncio.timeout(LIMIT_S):
-            while await plant("heater_W") == 0:
-                await asyncio.sleep(0.05)
+    path = stand_file(tmp_path, **{**REAL_TIME, "heat_module": {"watchdog_s": 1.5}})
+    async with heating_process(path) as (process, plant):
         process.send_signal(signal.SIGKILL)
         await asyncio.sleep(1.5 + 1.0)  # the plant's steps are of 0.5 s
         assert await plant("heater_W") == 0
         assert await plant("heater_enabled") == 1  # it is the module that has ended it
-    finally:
-        process.kill()
-        process.wait(LIMIT_S)
-        await control.close()
-        await asyncio.to_thread(simulator.stop)
 
 
 QUICK: dict[str, dict[str, object]] = {

@@ -4,23 +4,18 @@ import asyncio
 import signal
 import socket
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
-from tests import forked
 from tests.system.regulator_steps import steps_of, tuned_in
-from tests.system.virtual_stand import VirtualStand, bare_config, virtual_stand
+from tests.system.virtual_stand import LIMIT_S, REAL_TIME, VirtualStand, bare_config, heating_process, virtual_stand
 from thermostand.drivers.devices.regulators.pid import Law
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
 from thermostand.foundation.errors import DeviceFault, Occupied, Refused
 from thermostand.stand.service.by_hand import ByHand
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
 
-LIMIT_S = 60.0  # real, for what takes a few seconds on a machine that has other things to do
 RELAYS, HEAT = 2, 3  # unit, its relay
 
 
@@ -172,39 +167,13 @@ async def test_a_heat_relay_that_somebody_else_holds_is_switched_off_and_reporte
         assert [event.data["relay"] for event in stand.events if event.kind == "switched_off"][-1:] == ["heat"]
 
 
-RECIPE = "name: soak\nexperiments:\n  - steps:\n      - start_chamber: 45\n      - soak: 100000\n"
-FAST: dict[str, dict[str, object]] = {
-    "regulator": {"poll_s": 0.25, "sample_s": 0.25, "pulses": {"cycle_s": 2, "min_on_s": 0.1, "min_off_s": 0.1}},
-    "thermometer_module": {"poll_s": 0.25},
-    "relays": {"poll_s": 0.5, "self_test_s": 0.6},
-    "flap": {"poll_s": 0.5},
-    "guard": {"period_s": 0.5, "heater_hold_s": 30.0, "heater_renew_s": 5.0},
-    "recording": {"telemetry_commit_s": 0.2},
-}
-
-
 async def test_a_process_that_is_stopped_gives_no_heat_after_its_last_pulse(tmp_path: Path):
     """SIGSTOP, in real time: the pulse ends by the board's timer, long before the enable relay's hold of 30 s."""
-    config = bare_config("software-regulator", tmp_path, FAST)
-    simulator = await asyncio.to_thread(Simulator, laboratory_of(config, virtual=False, seed=None, is_anywhere=True))
-    control = ControlSocket(simulator.addresses["control"])
-    await control.open()
-
-    async def plant(quantity: str) -> float:
-        return float(str((await control.request({"do": "state"}))[quantity]))
-
-    data = yaml.safe_load((tmp_path / "software-regulator.yaml").read_text())
-    data["bus"]["address"] = simulator.addresses["bus"]
-    data["flap"]["backend_address"] = simulator.addresses["flap"]
-    data["simulation"]["control"] = simulator.addresses["control"]
-    (tmp_path / "stand.yaml").write_text(yaml.safe_dump(data))
-    (tmp_path / "recipe.yaml").write_text(RECIPE)
-    run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "stand.yaml", "--out", tmp_path / "out"]
-    process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
-    try:
-        async with asyncio.timeout(LIMIT_S):
-            while await plant("heater_W") == 0:
-                await asyncio.sleep(0.05)
+    pulses = {"cycle_s": 2, "min_on_s": 0.1, "min_off_s": 0.1}
+    bare_config(
+        "software-regulator", tmp_path, {**REAL_TIME, "regulator": {**REAL_TIME["regulator"], "pulses": pulses}}
+    )
+    async with heating_process(tmp_path / "software-regulator.yaml") as (process, plant):
         process.send_signal(signal.SIGSTOP)
         await asyncio.sleep(5.0)  # a cycle of 2 s, an overlap of 2 s
         assert await plant("heater_W") == 0
@@ -213,11 +182,6 @@ async def test_a_process_that_is_stopped_gives_no_heat_after_its_last_pulse(tmp_
         process.send_signal(signal.SIGINT)
         assert await asyncio.to_thread(process.wait, LIMIT_S) == 130
         assert await plant("heater_enabled") == 0
-    finally:
-        process.kill()
-        process.wait(LIMIT_S)
-        await control.close()
-        await asyncio.to_thread(simulator.stop)
 
 
 @pytest.mark.nightly

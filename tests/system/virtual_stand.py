@@ -1,15 +1,19 @@
-"""A stand on its wires in virtual time, guarded and kept, without a run: regulator, relays, thermometers, chamber."""
+"""A stand on its wires in virtual time, guarded and kept, without a run: regulator, relays, thermometers, chamber. And
+a run of such a stand in real time, in a process of its own, once it heats."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Mapping
+import subprocess
+import sys
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
 
+from tests import forked
 from tests.sections import change
 from thermostand.foundation.clock import VirtualClock, seconds_ns
 from thermostand.foundation.hub import Hub
@@ -103,3 +107,50 @@ async def virtual_stand(config: StandConfig) -> AsyncGenerator[VirtualStand]:
             yield stand
         finally:
             await open_stand.close()
+
+
+LIMIT_S = 60.0  # real, for what takes a few seconds on a machine that has other things to do
+SOAK_RECIPE = "name: soak\nexperiments:\n  - steps:\n      - start_chamber: 45\n      - soak: 100000\n"
+REAL_TIME: dict[str, dict[str, object]] = {
+    "regulator": {"poll_s": 0.25, "sample_s": 0.25},
+    "thermometer_module": {"poll_s": 0.25},
+    "relays": {"poll_s": 0.5, "self_test_s": 0.6},
+    "flap": {"poll_s": 0.5},
+    "guard": {"period_s": 0.5, "heater_hold_s": 30.0, "heater_renew_s": 5.0},
+    "recording": {"telemetry_commit_s": 0.2},
+}
+
+PlantQuantity = Callable[[str], Awaitable[float]]
+"""Of the simulated plant, by its name."""
+
+
+@asynccontextmanager
+async def heating_process(path: Path) -> AsyncGenerator[tuple[subprocess.Popen[str], PlantQuantity]]:
+    """A run of the stand in that file, which soaks and heats; and what tells a quantity of its plant."""
+    simulated = laboratory_of(load_config(path), virtual=False, seed=None, is_anywhere=True)
+    simulator = await asyncio.to_thread(Simulator, simulated)
+    control = ControlSocket(simulator.addresses["control"])
+    await control.open()
+
+    async def plant(quantity: str) -> float:
+        return float(str((await control.request({"do": "state"}))[quantity]))
+
+    data = yaml.safe_load(path.read_text())
+    data["bus"]["address"] = simulator.addresses["bus"]
+    data["flap"]["backend_address"] = simulator.addresses["flap"]
+    data["simulation"]["control"] = simulator.addresses["control"]
+    path.write_text(yaml.safe_dump(data))
+    recipe = path.with_name("recipe.yaml")
+    recipe.write_text(SOAK_RECIPE)
+    run = ["run", recipe, "--config", path, "--out", path.with_name("out")]
+    process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
+    try:
+        async with asyncio.timeout(LIMIT_S):
+            while await plant("heater_W") == 0:
+                await asyncio.sleep(0.05)
+        yield process, plant
+    finally:
+        process.kill()
+        process.wait(LIMIT_S)
+        await control.close()
+        await asyncio.to_thread(simulator.stop)
