@@ -61,6 +61,22 @@ from thermostand.stand.serving.desk import (
 )
 
 STAND = "a stand"
+STATUS = RunStatus(
+    recipe="thermal-cycle",
+    step=12,
+    steps=87,
+    doing="soak duration_s=2700",
+    state="held",
+    reasons=("disk_low", "operator"),
+    now_ns=1_767_290_400_000_000_000,
+    since_ns=1_767_290_340_000_000_000,
+    end_ns=1_767_294_000_000_000_000,
+    temperatures_degC={"thermometers.air": 23.98, "camera.temperature": None},
+    frames_saved=120,
+    frames_lost=1,
+    disk_free_bytes=12_300_000_000,
+    warning="a line\nand another",
+)
 KNOWN_FAULTS = (
     KnownFault(name="bus.drop", worst=0.05, mended=0.0, text="share of replies lost"),
     KnownFault(name="flap.jam", worst=2000, mended=None, text="feedback counts at which it stops"),

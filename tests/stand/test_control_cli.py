@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from tests.asking import ask
 from tests.host import Host
-from tests.stand.a_desk import ADesk, served
+from tests.stand.a_desk import STATUS, ADesk, served
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
@@ -30,23 +30,6 @@ from thermostand.stand.serving.api.access import user_name
 from thermostand.stand.serving.desk import FaultState, NotConfirmed, RunStatus
 
 runner = CliRunner()
-
-STATUS = RunStatus(
-    recipe="thermal-cycle",
-    step=12,
-    steps=87,
-    doing="soak duration_s=2700",
-    state="held",
-    reasons=("disk_low", "operator"),
-    now_ns=1_767_290_400_000_000_000,
-    since_ns=1_767_290_340_000_000_000,
-    end_ns=1_767_294_000_000_000_000,
-    temperatures_degC={"thermometers.air": 23.98, "camera.temperature": None},
-    frames_saved=120,
-    frames_lost=1,
-    disk_free_bytes=12_300_000_000,
-    warning="a line\nand another",
-)
 
 
 async def invoke(*arguments: str | Path) -> Result:

@@ -10,28 +10,11 @@ from pathlib import Path
 import pytest
 
 from tests.asking import ask, ask_status
-from tests.stand.a_desk import ADesk, served
+from tests.stand.a_desk import STATUS, ADesk, served
 from tests.stand.interface_client import entries_of, obeys
 from thermostand.foundation.errors import SessionError
 from thermostand.stand.serving.client import running_sessions
-from thermostand.stand.serving.desk import RunStatus
 from thermostand.stand.serving.presence import address_in, living, opened_folder
-
-STATUS = RunStatus(
-    recipe="thermal-cycle",
-    step=12,
-    steps=87,
-    doing="soak duration_s=2700",
-    state="running",
-    reasons=(),
-    now_ns=1_000_000_000_000,
-    since_ns=900_000_000_000,
-    end_ns=None,
-    temperatures_degC={"thermometers.air": 23.98, "camera.temperature": None},
-    frames_saved=120,
-    frames_lost=1,
-    disk_free_bytes=12_300_000_000,
-)
 
 HEALTH = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
 STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n\r\n"

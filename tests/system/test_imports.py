@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -12,46 +12,55 @@ from tests.recording.runs import record_run
 
 HEAVY = ("numba", "scipy", "cv2", "matplotlib")
 
-WORK = {
-    "stand": "import sys; sys.argv = ['stand', '--help']; from thermostand.stand.cli import app",
-    "compensate": "import sys; sys.argv = ['compensate', '--help']; from thermostand.compensation.cli import app",
+STAGES = {
+    "stand --help": "from thermostand.stand.cli import app; help_of(app, 'stand')",
+    "compensate --help": "from thermostand.compensation.cli import app; help_of(app, 'compensate')",
+    "rooms": "from thermostand import compensation, experiments, foundation, markers, recording, stand",
+    "session": "from thermostand.recording import Session; s = Session.open(sys.argv[1]); "
+    "s.channels(); s.frames_table(); s.holes",
+    "frame": "s.frame(0)",
+    "demo": "load('demo')",
+    "thermal-cycle-settled": "load('thermal-cycle-settled')",
 }
+"""In this order, in one interpreter: what a stage has loaded stays."""
+BEGIN = """
+import sys
+
+def help_of(app, name):
+    given, sys.argv = sys.argv, [name, "--help"]
+    try:
+        app()
+    except SystemExit as end:
+        assert not end.code
+    sys.argv = given
+
+def load(recipe):
+    import thermostand.stand.service.run
+    from thermostand.stand.running.executing.settling_watch import load_for
+    from thermostand.stand.running.order import load_order
+    load_for(load_order(recipe, "simulated").recipe.plan())
+"""
 
 
-def loaded(code: str) -> set[str]:
-    """Which of the heavy libraries a new interpreter has loaded at the end of the code."""
-    tail = f"\nimport sys\nsys.stderr.write('loaded ' + ' '.join({{*{HEAVY}}} & {{*sys.modules}}))"
-    done = subprocess.run([sys.executable, "-c", code + tail], capture_output=True, text=True, check=True)
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith("loaded")
-    return set(last.split()[1:])
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
+    """Which of the heavy libraries a new interpreter has loaded after each stage."""
+    night = asyncio.run(record_run(tmp_path_factory.mktemp("sessions") / "night"))
+    tell = f"print('loaded', *({{*{HEAVY}}} & {{*sys.modules}}), file=sys.stderr)"
+    code = BEGIN + "".join(f"{stage}\n{tell}\n" for stage in STAGES.values())
+    done = subprocess.run([sys.executable, "-c", code, str(night)], capture_output=True, text=True, check=True)
+    lines = [line.split()[1:] for line in done.stderr.splitlines() if line.startswith("loaded")]
+    return dict(zip(STAGES, map(set, lines), strict=True))
 
 
-@pytest.mark.parametrize("command", sorted(WORK))
-def test_help_loads_no_heavy_library(command: str):
-    assert loaded(f"{WORK[command]}\ntry:\n    app()\nexcept SystemExit as end:\n    assert not end.code") == set()
-
-
-def test_a_package_loads_no_heavy_library():
-    rooms = ("foundation.clock", "recording", "markers", "compensation", "experiments", "stand")
-    assert loaded(";".join(f"import thermostand.{room}" for room in rooms)) == set()
+@pytest.mark.parametrize("stage", ["stand --help", "compensate --help", "rooms", "session", "frame"])
+def test_help_packages_and_the_reading_of_a_session_load_no_heavy_library(loaded: dict[str, set[str]], stage: str):
+    assert loaded[stage] == set()
 
 
 # The second shows also that a heavy library would be found.
 @pytest.mark.parametrize(("recipe", "heavy"), [("demo", set[str]()), ("thermal-cycle-settled", {"numba", "scipy"})])
-def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(recipe: str, heavy: set[str]):
-    code = (
-        "import thermostand.stand.service.run\n"
-        "from thermostand.stand.running.order import load_order\n"
-        "from thermostand.stand.running.executing.settling_watch import load_for\n"
-        f"load_for(load_order({recipe!r}, 'simulated').recipe.plan())"
-    )
-    assert loaded(code) - {"cv2"} == heavy
-
-
-async def test_reading_a_session_loads_no_heavy_library(tmp_path: Path):
-    night = str(await record_run(tmp_path / "night"))
-    code = f"from thermostand.recording import Session; s = Session.open({night!r}); "
-    code += "s.channels(); s.frames_table(); s.holes"
-    assert loaded(code) == set()
-    assert loaded(f"{code}; s.frame(0)") == set()
+def test_what_the_looks_of_a_plan_need_is_imported_before_it_is_run(
+    loaded: dict[str, set[str]], recipe: str, heavy: set[str]
+):
+    assert loaded[recipe] - {"cv2"} == heavy
