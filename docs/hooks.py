@@ -2,6 +2,7 @@
 
 A page is either made whole (the files' references, from their schemas) or has a line `<!-- made: NAME -->`, which is
 replaced by what the function of that name gives: the steps, the events, the commands, the routes, the model file.
+A line `<!-- included: PATH -->` is replaced by that file of the project, as code.
 """
 
 from __future__ import annotations
@@ -54,9 +55,25 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in what is made, and write equations as MathML, which browsers draw by themselves."""
+    """Fill in what is made or included, and write equations as MathML, which browsers draw by themselves."""
     markdown = re.sub(r"<!-- made: (\w+) -->", lambda found: MADE[found[1]](), markdown)
-    return re.sub(r"```math\n(.*?)\n```", lambda found: convert(found[1], display="block"), markdown, flags=re.DOTALL)
+    markdown = re.sub(r"<!-- included: (\S+) -->", lambda found: _included(ROOT / found[1]), markdown)
+    return markdown if "```math" not in markdown else _EQUATION.sub(_drawn, markdown)
+
+
+# An equation of its own, one within a line, or code, which is left as it is.
+_EQUATION = re.compile(r"```math\n(?P<block>.*?)\n```|(?P<code>```.*?```|`[^`\n]+`)|\$(?P<inline>[^$\n]+)\$", re.DOTALL)
+
+
+def _drawn(found: re.Match[str]) -> str:
+    if found["code"]:
+        return found[0]
+    return convert(found["block"], display="block") if found["block"] else convert(found["inline"])
+
+
+def _included(path: Path) -> str:
+    language = {".py": "python", ".toml": "toml"}[path.suffix]
+    return f"```{language}\n{path.read_text(encoding='utf-8').rstrip()}\n```"
 
 
 def executed(notebook: Any) -> tuple[str, dict[str, bytes]]:

@@ -27,25 +27,8 @@ from .drawn_cameras import drawn_camera
 from .drawn_nights import Night, Stretch, night, reference, warm_up
 from .made_up_models import LIFE
 
-MODULE = '''
-from pydantic import Field
-from typing import Annotated
-from thermostand.compensation.drift.terms import Term
-from thermostand.compensation.expression import AIR, CAMERA, POWER, away, lag
-
-class Gradient(Term):
-    """Of a tube that is warm at the camera's end: a lag of a lag, times how long the camera has been on."""
-    kind = "tube gradient"
-    tau_s: Annotated[float, Field(gt=0)]
-
-    @property
-    def feature(self):
-        return away(lag(lag(CAMERA, self.tau_s), 300.0) - lag(AIR, self.tau_s)) * lag(POWER, 1200.0)
-
-    @classmethod
-    def usual(cls):
-        return (cls(tau_s=700.0), cls(tau_s=2000.0))
-'''
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "tube-term"
+MODULE = (EXAMPLE / "acme_tube.py").read_text(encoding="utf-8")
 VISITS = [Stretch(degC, 1500, "fit", 5) for degC in (52.0, 10.0, 45.0, 17.0, 31.0)]
 
 

@@ -35,7 +35,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", NOTEBOOK, re.DOTALL)
 @pytest.mark.usefixtures("undrawn")
 def test_what_the_notebook_page_shows_runs(recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert len(BLOCKS) == 7
-    (tmp_path / "night").symlink_to(recorded.path)
+    (tmp_path / "my-session").symlink_to(recorded.path)
     asyncio.run(record_calibration(tmp_path / "calibration", "calibration"))
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}

@@ -20,26 +20,8 @@ from thermostand.stand.commands.remedies import next_command, troubleshooting
 from thermostand.stand.config.stand_config import StandConfig, packaged
 from thermostand.stand.fault import Fault
 
-MODULE = """
-from pydantic import Field
-from thermostand.foundation.documents import Document
-from thermostand.stand.config.added_rules import GuardRule
-from thermostand.stand.fault import Fault, Watch, value_of
-
-class Settings(Document):
-    limit_degC: float = Field(default=30.0, le=40)
-    for_s: float = Field(default=0.0, ge=0)
-
-def watches(settings, config):
-    def rule(readings, now_ns):
-        value_degC = value_of(readings, "thermometers.laboratory")
-        if value_degC > settings.limit_degC:
-            return Fault("room_hot", f"the room of {config.name} is {value_degC:.1f} degC")
-        return None
-    return [Watch(rule, settings.for_s, "hold")]
-
-RULE = GuardRule("room_hot", "the laboratory is too warm", Settings, watches, "open a window")
-"""
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "room-rule"
+MODULE = (EXAMPLE / "acme_room.py").read_text(encoding="utf-8")
 
 
 @pytest.fixture(autouse=True)

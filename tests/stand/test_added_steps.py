@@ -33,33 +33,8 @@ from thermostand.stand.running.memory.entries import Skipped, decoded, edited, e
 from thermostand.stand.running.memory.fold import refusal
 from thermostand.stand.running.memory.state import RunState
 
-MODULE = '''
-from dataclasses import dataclass
-from typing import Annotated
-from pydantic import Field
-from thermostand.experiments.steps import Price, Step
-
-@dataclass(frozen=True, slots=True)
-class LampOn(Step):
-    """The lamp beside the target, at so many percent."""
-    kind = "lamp_on"
-    is_setup = True
-    says = "lamp at {percent:g} %"
-    form = Annotated[float, Field(ge=0, le=100)]
-    percent: float
-
-    def stand_fault(self, stand):
-        return "the lamp stands too near the camera" if self.percent > 90 else ""
-
-    def price(self, found, stand):
-        return Price(self.kind, 4.0)
-
-    async def perform(self, stand):
-        PERFORMED.append(self.percent)
-        await stand.table.check_home("lamp")
-
-PERFORMED = []
-'''
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "lamp-step"
+MODULE = (EXAMPLE / "acme_lamp.py").read_text(encoding="utf-8")
 START_NS = 1_767_290_400 * NS_PER_S
 
 

@@ -281,7 +281,7 @@ def _lines() -> Iterator[str]:
         "# Hazards",
         "",
         "What must not happen on a stand, by what it is found, how long that takes until heat and cold are off, and",
-        "what limits it when the computer is dead. Made by `python -m tests.system.hazards` from the table beside it;",
+        "what limits it when the computer is dead. Made by `python -m tests.system.hazards` from its table;",
         "the times are measured by `make nightly` on the simulated stand, which is polled each 5 s, with the faults",
         "that `stand simulate --faults` lists. Each rule of the guard and each of those faults has a row; a test sees",
         "to it.",

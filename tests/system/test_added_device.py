@@ -28,88 +28,9 @@ from thermostand.stand.service.hands_on import by_hand, known_devices
 from thermostand.stand.service.run import run_virtual
 from thermostand.stand.simulator import Simulator, laboratory_of, relocated
 
-MODULE = '''
-"""A lamp that a line of text switches, and that tells its current: `?` -> `I=0.25`, `on` and `off` -> `ok`."""
-
-from typing import Literal
-
-from thermostand.drivers.devices.kinds import VerbNumber, DeviceKind, Verb
-from thermostand.drivers.settings import Identity, Polled
-from thermostand.drivers.wires.line_client import LineClient
-from thermostand.drivers.wires.link import SerialSettings
-from thermostand.foundation.addresses import ByteAddress
-from thermostand.foundation.calls import Lane
-from thermostand.foundation.readings import Channel, Reading
-
-
-class Settings(Polled):
-    kind: Literal["lamp"]
-    address: ByteAddress
-    most_percent: float = 90.0
-
-
-class Lamp:
-    def __init__(self, name, settings, clock):
-        self.name, self.identity, self._clock, self._lane = name, None, clock, None
-        self._client = LineClient.at(name, settings.address, SerialSettings(9600, 1), (1.0, 0.0))
-
-    async def _ask(self, text):
-        def whole(data):
-            return data.decode() if data.endswith(b"\\n") else None
-
-        return (await self._lane.call(self._client.query, text.encode() + b"\\n", whole)).strip()
-
-    async def open(self):
-        self._lane = self._lane or Lane(self.name, self._clock)
-        await self._ask("?")
-        self.identity = Identity("Acme", "L1", "7", "")
-
-    async def close(self):
-        lane, self._lane = self._lane, None
-        if lane is not None:
-            await lane.call(self._client.close)
-            lane.close()
-
-    async def read(self):
-        current_A = float((await self._ask("?")).removeprefix("I="))
-        return (Reading(f"{self.name}.current", current_A, "A", self._clock.now_ns()),)
-
-    async def shine(self, percent):
-        await self._ask(f"{percent:g}")
-
-    async def make_safe(self):
-        await self.shine(0.0)
-
-
-KIND = DeviceKind(
-    name="lamp",
-    settings=Settings,
-    make=lambda name, settings, around: Lamp(name, settings, around.clock),
-    channels=(Channel("current", "A", "current"),),
-    verbs=(
-        Verb(
-            "shine",
-            "give light",
-            lambda stand, name, given: stand.device(name).shine(given["percent"]),
-            lambda settings, of_section: (VerbNumber("percent", "%", 0.0, settings.most_percent),),
-        ),
-    ),
-)
-'''
-FAKE = """
-from thermostand.drivers.sim.wire import LineEngine
-
-
-class FakeLamp:
-    def __init__(self, bench, name, settings):
-        self.percent = 0.0
-        bench.listen(name, settings["address"], lambda: LineEngine(self.answer))
-
-    def answer(self, line):
-        if line.strip() != b"?":
-            self.percent = float(line)
-        return b"I=%.2f" % (self.percent / 100)
-"""
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "lamp"
+MODULE = (EXAMPLE / "acme_lamp.py").read_text(encoding="utf-8")
+FAKE = (EXAMPLE / "acme_fake.py").read_text(encoding="utf-8")
 
 
 @pytest.fixture

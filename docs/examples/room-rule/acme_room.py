@@ -1,0 +1,31 @@
+"""A rule of the guard that holds a run while the laboratory is too warm."""
+
+from typing import Any
+
+from pydantic import Field
+
+from thermostand.foundation.documents import Document
+from thermostand.stand.config.added_rules import GuardRule
+from thermostand.stand.fault import Fault, Readings, Watch, value_of
+
+
+class Settings(Document):
+    """Its keys below `guard.added.room_hot` of a stand's file."""
+
+    limit_degC: float = Field(default=30.0, le=40)
+    for_s: float = Field(default=0.0, ge=0)
+
+
+def watches(settings: Settings, config: Any) -> list[Watch]:
+    """What is judged every `guard.period_s`, how long it must object, and what is then done."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        value_degC = value_of(readings, "thermometers.laboratory")
+        if value_degC > settings.limit_degC:
+            return Fault("room_hot", f"the room of {config.name} is {value_degC:.1f} degC")
+        return None
+
+    return [Watch(rule, settings.for_s, "hold")]
+
+
+RULE = GuardRule("room_hot", "the laboratory is too warm", Settings, watches, "open a window")
