@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import sys
 import tomllib
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -24,6 +25,7 @@ from thermostand.compensation.cli import app as compensate
 from thermostand.compensation.datasheet.details import Details
 from thermostand.experiments.steps import step_of
 from thermostand.foundation.documents import parse_document
+from thermostand.foundation.events import GUARD, KINDS
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.config.alerts_section import AlertSecrets
 from thermostand.stand.config.recipe import Recipe
@@ -101,7 +103,7 @@ def test_a_command_in_the_text_exists_with_its_options(page: Path):
 
 
 @pytest.fixture
-def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The packages of docs/examples, installed, in an empty folder with the files that pages name."""
     monkeypatch.syspath_prepend(tmp_path / "site")
     for folder in ("lamp", "room-rule"):
@@ -114,6 +116,10 @@ def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         install(tmp_path / "site", project["name"], modules, points)
     (tmp_path / "my-camera.xml").write_text("<RegisterDescription/>")
     monkeypatch.chdir(tmp_path)
+    yield
+    KINDS.pop(f"{GUARD}room_hot", None)
+    for module in ("acme_lamp", "acme_fake", "acme_room"):
+        sys.modules.pop(module, None)
 
 
 JOINED = {"guard", "chamber", "interface", "limits", "simulation"}
