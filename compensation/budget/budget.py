@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.budget.geometry import Geometry, StandState, UncertainValue
+from thermostand.compensation.budget.geometry import Geometry, ThermometerState, UncertainValue
 from thermostand.compensation.one_camera import channel_of
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE
@@ -19,7 +19,7 @@ from thermostand.markers.target import Target
 from thermostand.recording.reading.interpolation import interpolated
 from thermostand.recording.reading.session import Session
 
-_SENSORS = tuple(name.removesuffix("_degC") for name in StandState.__dataclass_fields__)
+_SENSORS = tuple(name.removesuffix("_degC") for name in ThermometerState.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,25 +31,25 @@ class CaptureState:
     chamber_degC: float
     start_ns: int
     end_ns: int
-    state: StandState
+    state: ThermometerState
 
 
-def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[StandState]:
+def states_at(session: Session, times_ns: NDArray[np.int64]) -> list[ThermometerState]:
     """The thermometers at each instant; NaN where one was BAD or silent for more than two minutes.
 
     SessionError when the session has no such thermometer.
     """
     columns = [interpolated(*session.readings(f"thermometers.{sensor}"), times_ns) for sensor in _SENSORS]
-    return [StandState(*map(float, row)) for row in np.stack(columns, axis=1)]
+    return [ThermometerState(*map(float, row)) for row in np.stack(columns, axis=1)]
 
 
-def mean_state(states: Sequence[StandState]) -> StandState:
+def mean_state(states: Sequence[ThermometerState]) -> ThermometerState:
     """The mean of each thermometer over the states that know it; NaN when none does."""
     table = np.array([[getattr(state, f"{sensor}_degC") for sensor in _SENSORS] for state in states])
     known = np.isfinite(table)
     counts = np.maximum(known.sum(axis=0), 1)
     means = np.where(known.any(axis=0), np.where(known, table, 0.0).sum(axis=0) / counts, math.nan)
-    return StandState(*map(float, means))
+    return ThermometerState(*map(float, means))
 
 
 def capture_states(session: Session) -> list[CaptureState]:
@@ -223,7 +223,7 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
 
 
-def displacement_px(state: StandState, reference: StandState, geometry: Geometry, xy_px: Float) -> Float:
+def displacement_px(state: ThermometerState, reference: ThermometerState, geometry: Geometry, xy_px: Float) -> Float:
     """The displacement of image points (..., 2) by granite, post, target and air, from `reference` to `state`."""
     centre = (np.array(geometry.image_px) - 1) / 2
     offset = np.asarray(xy_px, dtype=np.float64) - centre
@@ -237,19 +237,19 @@ def displacement_px(state: StandState, reference: StandState, geometry: Geometry
     return scale * offset + post * down + refraction
 
 
-def varied(state: StandState, geometry: Geometry) -> Iterator[tuple[StandState, Geometry]]:
+def varied(state: ThermometerState, geometry: Geometry) -> Iterator[tuple[ThermometerState, Geometry]]:
     """State and geometry with one uncertain input after the other larger by its standard uncertainty."""
     for name in Geometry.model_fields:
         quantity = getattr(geometry, name)
         if isinstance(quantity, UncertainValue) and quantity.u > 0:
             larger = UncertainValue(value=quantity.value + quantity.u, u=quantity.u)
             yield state, geometry.model_copy(update={name: larger})
-    for field in fields(StandState):
+    for field in fields(ThermometerState):
         on_granite = geometry.granite_gradient_K if field.name.startswith("granite") else 0.0
         yield state.warmer_by(**{field.name: math.hypot(geometry.thermometer_K, on_granite)}), geometry
 
 
-def granite_mm(state: StandState, reference: StandState, geometry: Geometry) -> float:
+def granite_mm(state: ThermometerState, reference: ThermometerState, geometry: Geometry) -> float:
     """How much the base has moved the target away from the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     outside_K = state.granite_outside_degC - reference.granite_outside_degC
@@ -257,24 +257,24 @@ def granite_mm(state: StandState, reference: StandState, geometry: Geometry) -> 
     return geometry.granite_per_K.value * lengths_mm_K
 
 
-def post_mm(state: StandState, reference: StandState, geometry: Geometry) -> float:
+def post_mm(state: ThermometerState, reference: ThermometerState, geometry: Geometry) -> float:
     """How much the post has lifted the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     return geometry.granite_per_K.value * geometry.post_mm.value * inside_K
 
 
-def target_strain(state: StandState, reference: StandState, geometry: Geometry) -> float:
+def target_strain(state: ThermometerState, reference: ThermometerState, geometry: Geometry) -> float:
     """Relative growth of the target."""
     return geometry.target_per_K.value * (state.artifact_degC - reference.artifact_degC)
 
 
-def refraction_px(state: StandState, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
+def refraction_px(state: ThermometerState, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996) -> Float:
     """How far points (..., 2), px from the principal point, appear outwards by the air's indices on both sides."""
     n1, n2 = indices(state, geometry, index)
     return appears_px(offset_px, geometry.focal_px, geometry.distance_mm.value, geometry.interface_mm.value, n1, n2)
 
 
-def indices(state: StandState, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
+def indices(state: ThermometerState, geometry: Geometry, index: Index = ciddor_1996) -> tuple[float, float]:
     """Refractive indices of the air at the camera and of the laboratory's."""
     pressure_Pa = geometry.pressure_Pa.value
     laboratory_Pa = geometry.relative_humidity.value * saturation_Pa(state.laboratory_degC)
@@ -283,7 +283,7 @@ def indices(state: StandState, geometry: Geometry, index: Index = ciddor_1996) -
     return n1, 1 + index(state.laboratory_degC, pressure_Pa, laboratory_Pa, geometry.wavelength_um)
 
 
-Effect = Callable[[StandState, Geometry], tuple[float, float]]
+Effect = Callable[[ThermometerState, Geometry], tuple[float, float]]
 """(state, geometry) -> (um on or of the target, px in the image)."""
 
 
@@ -307,7 +307,7 @@ class BudgetLine:
 class Budget:
     """A session's contributions against its reference state; coolest and warmest air at the camera during captures."""
 
-    reference: StandState
+    reference: ThermometerState
     air_degC: tuple[float, float]
     contributions: tuple[BudgetLine, ...]
 
@@ -353,32 +353,32 @@ def table(budget: Budget) -> str:
 
 
 def _thermal(
-    states: Sequence[StandState], reference: StandState, geometry: Geometry, radius_mm: float
+    states: Sequence[ThermometerState], reference: ThermometerState, geometry: Geometry, radius_mm: float
 ) -> list[BudgetLine]:
     um_per_px = 1e3 * geometry.distance_mm.value / geometry.focal_px
     corner_px = np.array([(geometry.image_px[0] - 1) / 2, (geometry.image_px[1] - 1) / 2])
 
-    def granite(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def granite(state: ThermometerState, stand: Geometry) -> tuple[float, float]:
         away_mm = granite_mm(state, reference, stand)
         return 1e3 * away_mm, -away_mm / stand.distance_mm.value * float(np.linalg.norm(corner_px))
 
-    def post(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def post(state: ThermometerState, stand: Geometry) -> tuple[float, float]:
         up_mm = post_mm(state, reference, stand)
         return 1e3 * up_mm, up_mm * stand.focal_px / stand.distance_mm.value
 
-    def growth(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def growth(state: ThermometerState, stand: Geometry) -> tuple[float, float]:
         outwards_mm = target_strain(state, reference, stand) * radius_mm
         return 1e3 * outwards_mm, outwards_mm * stand.focal_px / stand.distance_mm.value
 
     def refraction(index: Index) -> Effect:
-        def of(state: StandState, stand: Geometry) -> tuple[float, float]:
+        def of(state: ThermometerState, stand: Geometry) -> tuple[float, float]:
             moved = refraction_px(state, stand, corner_px, index) - refraction_px(reference, stand, corner_px, index)
             outwards_px = float(np.sign(moved[0]) * np.linalg.norm(moved))
             return outwards_px * um_per_px, outwards_px
 
         return of
 
-    def tilted(state: StandState, stand: Geometry) -> tuple[float, float]:
+    def tilted(state: ThermometerState, stand: Geometry) -> tuple[float, float]:
         tilt_rad, interface_mm = math.radians(stand.interface_tilt_deg), stand.interface_mm.value
         now, before = (
             tilted_shift_mm(tilt_rad, stand.distance_mm.value, interface_mm, *indices(at, stand))
@@ -405,7 +405,7 @@ def _thermal(
 def _largest(
     name: str,
     effect: Effect,
-    states: Sequence[StandState],
+    states: Sequence[ThermometerState],
     geometry: Geometry,
     where: str,
     corrected: bool = False,
@@ -457,8 +457,8 @@ def _outermost_mm(target: Target) -> float:
     return float(np.linalg.norm(places - (places.min(axis=0) + places.max(axis=0)) / 2, axis=1).max())
 
 
-def _is_known(state: StandState) -> bool:
-    return all(math.isfinite(getattr(state, name)) for name in StandState.__dataclass_fields__)
+def _is_known(state: ThermometerState) -> bool:
+    return all(math.isfinite(getattr(state, name)) for name in ThermometerState.__dataclass_fields__)
 
 
 def _number(value: float, width: int, digits: int) -> str:

@@ -65,7 +65,7 @@ class Geometry(Document):
 
 
 @dataclass(frozen=True, slots=True)
-class StandState:
+class ThermometerState:
     """The five thermometers at an instant, or the mean of a while, degC."""
 
     granite_inside_degC: float
@@ -74,7 +74,7 @@ class StandState:
     air_degC: float
     laboratory_degC: float
 
-    def warmer_by(self, **change_K: float) -> StandState:
+    def warmer_by(self, **change_K: float) -> ThermometerState:
         """The state with some thermometers (field names) changed by so many K."""
         return replace(self, **{name: getattr(self, name) + change for name, change in change_K.items()})
 

@@ -39,7 +39,7 @@ _WIDE_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scan:
+class StepScan:
     """gain (B,): by how much the log likelihood grows with a step at each of B boundaries. amount_px, sigma_px (B,): of
     that step, and its standard uncertainty."""
 
@@ -70,7 +70,7 @@ def whitened(features: Float, hours: Float, variance_px2: Float, steps: Float, k
     return Whitened(inverse, log_determinant, inverse @ steps)
 
 
-def scan(white: Whitened, values_px: Float) -> Scan:
+def scan(white: Whitened, values_px: Float) -> StepScan:
     """Of values (K,)."""
     own = white.inverse @ values_px
     without = -0.5 * ((own**2).sum(axis=1) + white.log_determinant)
@@ -79,7 +79,7 @@ def scan(white: Whitened, values_px: Float) -> Scan:
     with_step = without[:, None] + 0.5 * along**2 / square
     best = with_step.argmax(axis=0)
     at = np.arange(square.shape[1])
-    return Scan(
+    return StepScan(
         gain=with_step[best, at] - without.max(),
         amount_px=along[best, at] / square[best, at],
         sigma_px=1 / np.sqrt(square[best, at]),
@@ -385,7 +385,7 @@ def _largest(series: NightSeries, known: Index) -> tuple[int, float]:
     return int(series.boundaries[best]), float(size) if gain[best] >= _GAIN else 0.0
 
 
-def _scans(series: NightSeries, boundaries: Index, known: Index) -> list[Scan]:
+def _scans(series: NightSeries, boundaries: Index, known: Index) -> list[StepScan]:
     return [
         scan(
             _white(series, series.variance_px2[:, axis], boundaries, known),

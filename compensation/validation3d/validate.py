@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thermostand.compensation.budget.budget import displacement_px, mean_state, states_at, varied
-from thermostand.compensation.budget.geometry import Geometry, StandState, UncertainValue
+from thermostand.compensation.budget.geometry import Geometry, ThermometerState, UncertainValue
 from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.calibrate import ray_name
 from thermostand.compensation.calibration.camera_file import CameraFile
@@ -440,8 +440,8 @@ def stand_part(
     return StandPart(here[0], excess[0], here[1:] - here[0], excess[1:] - excess[0])
 
 
-def _check_known(session: Session, states: list[StandState]) -> None:
-    for name in StandState.__dataclass_fields__:
+def _check_known(session: Session, states: list[ThermometerState]) -> None:
+    for name in ThermometerState.__dataclass_fields__:
         if not all(math.isfinite(getattr(state, name)) for state in states):
             silent = name.removesuffix("_degC")
             raise SessionError(
@@ -454,7 +454,9 @@ def _moved(geometry: Geometry, distance_mm: float) -> UncertainValue:
     return UncertainValue(value=distance_mm, u=geometry.distance_mm.u)
 
 
-def _displacements_px(state: StandState, reference: StandState, geometry: Geometry, centres_px: Float) -> Float:
+def _displacements_px(
+    state: ThermometerState, reference: ThermometerState, geometry: Geometry, centres_px: Float
+) -> Float:
     """(1 + V, N, 2): nominal, and with each uncertain input larger in turn."""
     inputs = [(state, geometry), *varied(state, geometry)]
     return np.array([displacement_px(each, reference, stand, centres_px) for each, stand in inputs])

@@ -247,7 +247,7 @@ class ForwardingBackend(IBackend):
         """No kernel driver knows of it."""
         return False
 
-    def ctrl_transfer(
+    def ctrl_transfer(  # pyusb calls it so, by position
         self,
         dev_handle: Handle,
         bmRequestType: int,

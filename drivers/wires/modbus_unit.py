@@ -14,11 +14,11 @@ from typing import NamedTuple
 from thermostand.drivers.settings import Identity, same_device
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.registers import (
-    Command,
     IdentityPoint,
     InForceCheck,
     Point,
     PointType,
+    RegisterCommand,
     RegisterMap,
     Space,
     Split,
@@ -192,7 +192,7 @@ class ModbusUnit:
             raise lost
 
 
-def is_confirmed(command: Command, snapshot: Snapshot) -> bool:
+def is_confirmed(command: RegisterCommand, snapshot: Snapshot) -> bool:
     """Whether what confirms `command` is so in a snapshot that has read its point."""
     confirm = command.confirm
     if confirm.equals is not None:

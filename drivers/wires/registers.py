@@ -129,7 +129,7 @@ class Write(Document):
     value: Word
 
 
-class Command(Document):
+class RegisterCommand(Document):
     """Register writes that make the unit do something: one, `address` and `value`, or `writes`, in their order."""
 
     address: Word | None = None
@@ -177,7 +177,7 @@ class InForceCheck(Document):
         return f"{self.bit} is {int(self.is_)}" if self.bit else f"{self.point} is {self.equals:g}"
 
 
-class Probe(Document):
+class UnitProof(Document):
     """A point whose value proves that the unit is the one this map describes."""
 
     point: str
@@ -203,13 +203,13 @@ class RegisterMap(Document):
     source: str
     when_silent: str = ""
     transport: Transport
-    probe: tuple[Probe, ...] = ()
+    probe: tuple[UnitProof, ...] = ()
     identity: dict[Literal["serial_number", "model", "version"], IdentityPoint] = Field(default_factory=dict)
     points: dict[str, Point] = Field(min_length=1)
     fault_bits: tuple[str, ...] = ()
     in_force: tuple[InForceCheck, ...] = ()
     not_told: str = ""
-    commands: dict[str, Command] = Field(default_factory=dict)
+    commands: dict[str, RegisterCommand] = Field(default_factory=dict)
     startup: tuple[str, ...] = ()
     safe_state: tuple[str, ...] = ()
 

@@ -163,11 +163,13 @@ def canonical(value: float) -> float:
 def remarked(remark: Any) -> Reading:
     """The inverse of remark_of; SessionError when it is none."""
     cause = CAUSES.get(remark.cause, "")
-    return reading_of(remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, remark.reason, cause)
+    return reading_of(
+        remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, reason=remark.reason, cause=cause
+    )
 
 
 def reading_of(
-    channel: str, value: float, unit: str, time_ns: int, quality: int, reason: str = "", cause: Cause = ""
+    channel: str, value: float, unit: str, time_ns: int, quality: int, *, reason: str = "", cause: Cause = ""
 ) -> Reading:
     """A recorded reading; SessionError when its value does not fit its quality."""
     try:

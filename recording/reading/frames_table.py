@@ -93,7 +93,7 @@ class FramesTable:
         return import_extra("pyarrow", "parquet").table(self.columns())
 
 
-class Recorded(Protocol):
+class RecordedSession(Protocol):
     """What is asked of a session."""
 
     def steps(self) -> list[StepMark]:
@@ -113,7 +113,7 @@ class Recorded(Protocol):
         ...
 
 
-def frames_table(session: Recorded, places: Sequence[FramePlace]) -> FramesTable:
+def frames_table(session: RecordedSession, places: Sequence[FramePlace]) -> FramesTable:
     """The table of the frames at these places."""
     metas = [place.meta for place in places]
     times_ns = np.array([meta.time_ns for meta in metas], np.int64)
@@ -140,13 +140,13 @@ def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
 
-def _axes(session: Recorded) -> list[str]:
+def _axes(session: RecordedSession) -> list[str]:
     """The devices that report a position and whether they move."""
     channels = set(session.channels())
     return [name.removesuffix(".moving") for name in sorted(channels) if name.endswith(".moving")]
 
 
-def _at(session: Recorded, channel: str, times_ns: NDArray[np.int64]) -> Float:
+def _at(session: RecordedSession, channel: str, times_ns: NDArray[np.int64]) -> Float:
     try:
         return interpolated(*session.readings(channel), times_ns)
     except SessionError:

@@ -17,7 +17,7 @@ from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.output import say, show
 from thermostand.foundation.usage import one_line
-from thermostand.stand.config.new_stand import Axis, Connected, new_stand
+from thermostand.stand.config.new_stand import Connected, ConnectedAxis, new_stand
 from thermostand.stand.estimating.run_estimate import price_night
 from thermostand.stand.running.order import load_order
 
@@ -129,12 +129,12 @@ def _number(port: SerialPort) -> int:
     return int(found[1], 16) if found else 0
 
 
-def _axis(text: str) -> Axis:
+def _axis(text: str) -> ConnectedAxis:
     name, _, rest = text.partition("=")
     address, _, serial = rest.rpartition(":")
     if name not in _AXES or not address or not serial.isdecimal():
         raise ConfigError(f"--axis {text}: expected linear=PORT:SERIAL or rotary=PORT:SERIAL")
-    return Axis(name, address, int(serial))
+    return ConnectedAxis(name, address, int(serial))
 
 
 def _identified(connected: Connected) -> Connected:

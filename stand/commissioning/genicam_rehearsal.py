@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.devices.cameras.camera_gige import Settings as GigeSettings
 from thermostand.drivers.wires import camera_dialects as words
 from thermostand.foundation.clock import WallClock
@@ -86,7 +86,7 @@ def _cannot_play(error: DeviceError, unplayed: tuple[str, ...]) -> str:
 
 
 async def _opened(settings: GigeSettings, unplayed: tuple[str, ...]) -> Rehearsal:
-    camera = Camera(_NAME, settings, WallClock())
+    camera = AravisCamera(_NAME, settings, WallClock())
     who = ""
     try:
         await camera.open()

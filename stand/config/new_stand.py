@@ -24,7 +24,7 @@ In this order:
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class ConnectedAxis:
     """A stage: the address of its controller, which is asked for its serial number before anything moves."""
 
     name: str
@@ -42,7 +42,7 @@ class Connected:
     flap: str = ""
     camera: str = ""
     camera_serial: str = ""
-    axes: Sequence[Axis] = ()
+    axes: Sequence[ConnectedAxis] = ()
 
 
 def new_stand(name: str, connected: Connected | None) -> dict[str, str]:

@@ -35,7 +35,7 @@ from thermostand.stand.running.memory.entries import (
     Begun,
     Ended,
     Entry,
-    Step,
+    StepChanged,
     Taken,
     Tripped,
     Written,
@@ -178,7 +178,7 @@ def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Itera
     known = {(entry.time_ns, step_id) for entry in entries if isinstance(entry, Again) for step_id in entry.step_ids}
     for item in items:
         if isinstance(item, StepMark) and item.state is StepState.DONE:
-            done.append(Step(item.time_ns, item.step_id, "done"))
+            done.append(StepChanged(item.time_ns, item.step_id, "done"))
         if isinstance(item, Event):
             step_id = restarted_step(item)
             if step_id and (item.time_ns, step_id) not in known:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.bench.figures import Figure, progress, require_aravis, side_by_side
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera, HEIGHT_px, WIDTH_px
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
@@ -49,11 +49,11 @@ def _at_pace(what: str, pace_MBps: int) -> Figure:
         address=ADDRESS, serial_number=SERIAL_NUMBER, exposure_s=0.001, packet_size=PACKET_SIZE
     )
     with _fake(pace_MBps):
-        own, limit = asyncio.run(_measure(Camera("camera", settings, WallClock()), pace_MBps))
+        own, limit = asyncio.run(_measure(AravisCamera("camera", settings, WallClock()), pace_MBps))
     return side_by_side(what, "frames/s", f"wire paced at {pace_MBps} MB/s", own, limit)
 
 
-async def _measure(camera: Camera, pace_MBps: int) -> tuple[list[float], list[float]]:
+async def _measure(camera: AravisCamera, pace_MBps: int) -> tuple[list[float], list[float]]:
     await camera.open()
     try:
         packets = math.ceil(camera.effective.payload_bytes / (PACKET_SIZE - HEADERS_bytes)) + LEADER_AND_TRAILER
@@ -64,7 +64,7 @@ async def _measure(camera: Camera, pace_MBps: int) -> tuple[list[float], list[fl
     return own, [pace_MBps * 1e6 / (packets * PACKET_SIZE)] * ROUNDS
 
 
-async def _frames_per_second(camera: Camera) -> float:
+async def _frames_per_second(camera: AravisCamera) -> float:
     begin_s = time.perf_counter()
     for _ in range(FRAMES):
         await camera.grab()

@@ -28,7 +28,7 @@ from thermostand.compensation.budget.budget import (
     saturation_Pa,
     varied,
 )
-from thermostand.compensation.budget.geometry import Geometry, StandState, load_geometry
+from thermostand.compensation.budget.geometry import Geometry, ThermometerState, load_geometry
 from thermostand.drivers.sim.physics import optics
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
@@ -42,7 +42,7 @@ from .rendered import Scene, photograph, render
 
 PAPER = load_geometry("paper")
 TARGET = load_target(packaged("targets", "paper-9x6"))
-COOL = StandState(24.0, 24.0, 24.0, 24.0, 24.0)
+COOL = ThermometerState(24.0, 24.0, 24.0, 24.0, 24.0)
 CENTRE_px = np.array([1223.5, 1023.5])
 CORNER_px = np.array([2447.0, 2047.0])
 
@@ -103,7 +103,7 @@ def test_the_correction_takes_out_what_the_simulated_stand_does():
     assert (np.abs(left) < 2 * sigma_px(state, COOL, geometry, after) + 1e-4).all()
 
 
-def sigma_px(state: StandState, reference: StandState, geometry: Geometry, xy_px: np.ndarray) -> np.ndarray:
+def sigma_px(state: ThermometerState, reference: ThermometerState, geometry: Geometry, xy_px: np.ndarray) -> np.ndarray:
     """Of the displacement: every uncertain input larger in turn, as a validation does."""
     nominal = displacement_px(state, reference, geometry, xy_px)
     moved = [displacement_px(each, reference, other, xy_px) - nominal for each, other in varied(state, geometry)]
@@ -163,7 +163,7 @@ def test_home_checks_are_read_from_the_recorded_events():
     assert rotary.rms == pytest.approx(0.005)
 
 
-WARM = StandState(50.0, 27.0, 25.0, 52.0, 24.5)
+WARM = ThermometerState(50.0, 27.0, 25.0, 52.0, 24.5)
 CAPTURES = (
     ("reference", COOL),
     ("pose", COOL),

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.budget.budget import Budget, BudgetLine
-from thermostand.compensation.budget.geometry import StandState
+from thermostand.compensation.budget.geometry import ThermometerState
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.drift.terms import features
@@ -43,7 +43,7 @@ from .synthetic import Float, facts, observations, places_px, quadratic
 
 Analysed = tuple[Observations, PaperModel, Evaluation]
 BUDGET = Budget(
-    reference=StandState(24.01, 24.02, 24.03, 24.04, 24.05),
+    reference=ThermometerState(24.01, 24.02, 24.03, 24.04, 24.05),
     air_degC=(10.5, 51.5),
     contributions=(
         BudgetLine("granite along the axis", 25.17, -0.04861, "the frame's corner", 4.05, 0.00782, True),

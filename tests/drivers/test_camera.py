@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.stock_camera import ADDRESS, SERIAL
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ERRORS, AravisError
 from thermostand.drivers.wires.camera_errors import device_error
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
@@ -32,9 +32,9 @@ class Opened:
     """async with Opened(...) as camera: opened, and closed whatever happens."""
 
     def __init__(self, **changes: object) -> None:
-        self.camera = Camera("camera", settings(**changes), WallClock())
+        self.camera = AravisCamera("camera", settings(**changes), WallClock())
 
-    async def __aenter__(self) -> Camera:
+    async def __aenter__(self) -> AravisCamera:
         await self.camera.open()
         return self.camera
 
@@ -43,7 +43,7 @@ class Opened:
 
 
 async def refusal(asked: GigeCameraSettings) -> str:
-    camera = Camera("camera", asked, WallClock())
+    camera = AravisCamera("camera", asked, WallClock())
     with pytest.raises(Refused) as caught:
         await camera.open()
     await camera.close()
@@ -234,7 +234,7 @@ async def test_a_temperature_register_is_scaled_and_checked(
 
 @pytest.mark.usefixtures("stock_camera")
 async def test_a_closed_camera_is_unreachable_until_it_is_opened_again():
-    camera = Camera("camera", settings(), WallClock())
+    camera = AravisCamera("camera", settings(), WallClock())
     await camera.close()
     with pytest.raises(Unreachable, match="not open"):
         await camera.grab()
@@ -255,7 +255,7 @@ async def test_a_closed_camera_is_unreachable_until_it_is_opened_again():
 
 
 async def test_an_address_where_nobody_answers_is_unreachable():
-    camera = Camera("camera", GigeCameraSettings(address="127.0.0.62"), WallClock())
+    camera = AravisCamera("camera", GigeCameraSettings(address="127.0.0.62"), WallClock())
     with pytest.raises(Unreachable, match=r"127\.0\.0\.62"):
         await camera.open()
     await camera.close()

@@ -32,7 +32,7 @@ from tests.dialects import (
 )
 from tests.still_plant import StillPlant
 from tests.system.conftest import require_aravis
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, AravisError
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Registers
@@ -82,7 +82,7 @@ def dressed(file: GenicamFile | None, size_px: tuple[int, int] = (WIDTH, HEIGHT)
 @asynccontextmanager
 async def opened(**changes: object):
     usual = {"address": usual_camera_address(), "exposure_s": 0.01, "packet_size": 1500}
-    camera = Camera("eye", GigeCameraSettings.model_validate({**usual, **changes}), WallClock())
+    camera = AravisCamera("eye", GigeCameraSettings.model_validate({**usual, **changes}), WallClock())
     try:
         await camera.open()
         yield camera

@@ -23,7 +23,7 @@ from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import INTERLOCK, OPERATOR
 from thermostand.stand.running.course import check_edit
-from thermostand.stand.running.memory.entries import Step as StepMarked
+from thermostand.stand.running.memory.entries import StepChanged as StepChanged
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.service.stand_service import ExtendRequest, PauseRequest, SkipRequest
 from thermostand.stand.serving.api.doors import Interface
@@ -161,8 +161,8 @@ class NightDesk(ADesk):
         """As a run does, whose plan is this night's."""
         shown = self.plan()
         plan = [PlannedStep(each.index, each.step_id, step_of(each.kind, dict(each.parameters))) for each in shown]
-        marks = [StepMarked(0, each.step_id, "started") for each in shown if each.standing != "waiting"]
-        marks += [StepMarked(0, each.step_id, "done") for each in shown if each.standing == "done"]
+        marks = [StepChanged(0, each.step_id, "started") for each in shown if each.standing != "waiting"]
+        marks += [StepChanged(0, each.step_id, "done") for each in shown if each.standing == "done"]
         return check_edit(fold(plan, marks), from_index, steps, self.config)
 
     def devices(self) -> tuple[DeviceState, ...]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.devices.cameras.cameras_by_protocol import line_findings
 from thermostand.drivers.devices.cameras.shared_line import camera_lines
 from thermostand.drivers.wires.camera_line import frame_wire_s, packet_delay_ns
@@ -75,9 +75,9 @@ def test_the_check_shows_what_each_camera_needs_of_a_shared_line():
 
 def test_each_camera_learns_how_many_share_its_line():
     cameras = assemble(of(3), Hub(), WallClock()).devices.cameras.values()
-    assert [camera.settings.line_shared_by for camera in cameras if isinstance(camera, Camera)] == [3, 3, 3]
+    assert [camera.settings.line_shared_by for camera in cameras if isinstance(camera, AravisCamera)] == [3, 3, 3]
     own = assemble(of(2, line_shared_by=1), Hub(), WallClock()).devices.cameras["camera"]
-    assert isinstance(own, Camera)
+    assert isinstance(own, AravisCamera)
     assert own.settings.line_shared_by == 1
 
 

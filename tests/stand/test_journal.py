@@ -15,19 +15,29 @@ from tests.journals import MARK, lines_with, read_lines
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.journal_lines import journal_lines, lines_of
-from thermostand.stand.running.memory.entries import Begun, Cleared, Dwell, Ended, Gap, Held, Step, Tripped, decoded
+from thermostand.stand.running.memory.entries import (
+    Begun,
+    Cleared,
+    Dwell,
+    Ended,
+    Gap,
+    Held,
+    StepChanged,
+    Tripped,
+    decoded,
+)
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, taken_over
 
 ENTRIES = [
     Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),
-    Step(2, "a1", "started"),
+    StepChanged(2, "a1", "started"),
     Dwell(3, "a1", 60.0),
     Held(4, "operator", True),
     Held(5, "operator", False),
     Gap(5, 8),
     Tripped(6, "over_temperature", "too hot"),
     Cleared(8),
-    Step(9, "a1", "done"),
+    StepChanged(9, "a1", "done"),
     Ended(10, "stopped", "stopped by the operator: “✓”\n"),
 ]
 
@@ -35,7 +45,7 @@ times_ns = st.integers(0, 2**62)
 words = st.text(max_size=20)
 entries = st.one_of(
     st.builds(Begun, times_ns, words, words, st.dictionaries(words, words, max_size=3), st.none() | st.integers(0)),
-    st.builds(Step, times_ns, words, st.sampled_from(["started", "done"])),
+    st.builds(StepChanged, times_ns, words, st.sampled_from(["started", "done"])),
     st.builds(Dwell, times_ns, words, st.floats(0, 1e6)),
     st.builds(Held, times_ns, words, st.booleans()),
     st.builds(Gap, times_ns, times_ns),

@@ -33,7 +33,7 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.stand.gate import OPERATOR
-from thermostand.stand.running.memory.entries import Change, Edited, Extended, Skipped, Step, change_of, data_of
+from thermostand.stand.running.memory.entries import Change, Edited, Extended, Skipped, StepChanged, change_of, data_of
 from thermostand.stand.running.memory.fold import fold, refusal
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 
@@ -221,7 +221,7 @@ def test_a_plan_that_this_stand_may_not_do_changes_nothing(life: Callable[..., L
     assert not [item for item in here.reported if isinstance(item, Event) and item.kind == "plan_changed"]
 
 
-BEGUN = fold(PLAN, [Step(0, ID[0], "started"), Step(0, ID[0], "done"), Step(0, ID[1], "started")])
+BEGUN = fold(PLAN, [StepChanged(0, ID[0], "started"), StepChanged(0, ID[0], "done"), StepChanged(0, ID[1], "started")])
 
 
 @pytest.mark.parametrize(
@@ -245,7 +245,9 @@ BEGUN = fold(PLAN, [Step(0, ID[0], "started"), Step(0, ID[0], "done"), Step(0, I
 )
 def test_what_cannot_be_changed_says_why_and_changes_nothing(change: Change, why: str):
     assert refusal(BEGUN, change) == why
-    assert (fold(PLAN, [Step(0, ID[0], "done"), Step(0, ID[1], "started"), change]).changes == ()) is bool(why)
+    assert (
+        fold(PLAN, [StepChanged(0, ID[0], "done"), StepChanged(0, ID[1], "started"), change]).changes == ()
+    ) is bool(why)
 
 
 @pytest.mark.parametrize(

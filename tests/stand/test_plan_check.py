@@ -11,13 +11,13 @@ from tests.stand.a_desk import ADesk, served
 from thermostand.experiments.steps import Capture, OpenFlap, Soak, StartChamber, StopChamber, number_steps
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.running.course import check_edit, steps_of
-from thermostand.stand.running.memory.entries import Step
+from thermostand.stand.running.memory.entries import StepChanged
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.serving.client import server_of
 from thermostand.stand.serving.desk import WrittenStep
 
 PLAN = tuple(number_steps([StartChamber(24.0), Soak(60.0), OpenFlap(), StopChamber()]))
-BEGUN = fold(PLAN, [Step(0, PLAN[0].step_id, "started"), Step(0, PLAN[0].step_id, "done")])
+BEGUN = fold(PLAN, [StepChanged(0, PLAN[0].step_id, "started"), StepChanged(0, PLAN[0].step_id, "done")])
 CONFIG = load_config(packaged("", "simulated"))
 
 

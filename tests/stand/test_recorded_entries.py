@@ -26,7 +26,7 @@ from thermostand.stand.running.memory.entries import (
     Entry,
     Held,
     Skipped,
-    Step,
+    StepChanged,
     Taken,
     Tripped,
     data_of,
@@ -47,14 +47,14 @@ def plan_changed(change: Skipped) -> Event:
 
 
 def test_a_step_is_done_when_its_end_is_recorded_and_not_when_it_was_begun_or_failed():
-    started = Step(2, CAPTURE, "started")
+    started = StepChanged(2, CAPTURE, "started")
     items = [mark(2, CAPTURE, StepState.STARTED), mark(5, WARM, StepState.FAILED), mark(4, CAPTURE, StepState.DONE)]
     frames = [(3, CAPTURE)]
     assert with_recorded([BEGUN, started], items, frames) == [
         BEGUN,
         started,
         Taken(3, CAPTURE),
-        Step(4, CAPTURE, "done"),
+        StepChanged(4, CAPTURE, "done"),
     ]
 
 
@@ -75,7 +75,7 @@ def test_of_an_instant_in_which_a_capture_is_begun_again_its_end_before_does_not
     items = [mark(5, CAPTURE, StepState.DONE)]
     assert with_recorded([BEGUN, again], items, [(5, CAPTURE)]) == [
         BEGUN,
-        Step(5, CAPTURE, "done"),
+        StepChanged(5, CAPTURE, "done"),
         again,
         Taken(5, CAPTURE),
     ]
@@ -127,11 +127,11 @@ async def test_the_end_of_a_run_is_the_last_entry_of_its_journal_which_nobody_ha
     logbook = Logbook(Hub(), WallClock(), fold(PLAN, []))
     await logbook.end(Ended(1, "stopped", ""), Patience())  # nothing was begun
     await logbook.begin(Journal.create(tmp_path), BEGUN)
-    await logbook.write(Step(2, ID[0], "started"))
+    await logbook.write(StepChanged(2, ID[0], "started"))
     await logbook.end(Ended(3, "stopped", "by the operator"), Patience())
     journal, entries = Journal.open(tmp_path)
     journal.release()
-    assert entries[:2] == [BEGUN, Step(2, ID[0], "started")]
+    assert entries[:2] == [BEGUN, StepChanged(2, ID[0], "started")]
     (ended,) = entries[2:]
     assert isinstance(ended, Ended)
     assert (ended.status, ended.text) == ("stopped", "by the operator")

@@ -26,7 +26,7 @@ from thermostand.stand.running.memory.entries import (
     Readying,
     Restored,
     Skipped,
-    Step,
+    StepChanged,
     Taken,
     Tripped,
     Written,
@@ -39,7 +39,7 @@ ids = st.sampled_from([*ID, "unknown"])
 soak = {"kind": "soak", "parameters": {"duration_s": 5.0}}
 open_flap = {"kind": "open_flap", "parameters": {}}
 KINDS = {
-    Step: st.tuples(ids, st.sampled_from(["started", "done"])),
+    StepChanged: st.tuples(ids, st.sampled_from(["started", "done"])),
     Dwell: st.tuples(ids, st.floats(0, 200)),
     Held: st.tuples(st.sampled_from(["operator", "interlock", "disk_low"]), st.booleans()),
     Again: st.tuples(st.lists(ids, max_size=3), st.integers(0, 2)),
@@ -123,7 +123,7 @@ def test_the_lines_of_a_journal_make_the_same_state(entries):
     [
         Dwell(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
         Dwell(0, [], 1.0),  # pyright: ignore[reportArgumentType]
-        Step(0, {}, "done"),  # pyright: ignore[reportArgumentType]
+        StepChanged(0, {}, "done"),  # pyright: ignore[reportArgumentType]
         Again(0, 7),  # pyright: ignore[reportArgumentType]
         Extended(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
         Edited(0, "first", []),  # pyright: ignore[reportArgumentType]
@@ -146,12 +146,12 @@ def test_steps_that_are_none_are_refused(by):
 @pytest.mark.parametrize(
     ("entries", "is_unsettled"),
     [
-        ([Dwell(0, ID[3], 100.0, "settled"), Step(0, ID[3], "done")], False),
-        ([Dwell(0, ID[3], 100.0, "unsettled"), Step(0, ID[3], "done")], True),
+        ([Dwell(0, ID[3], 100.0, "settled"), StepChanged(0, ID[3], "done")], False),
+        ([Dwell(0, ID[3], 100.0, "unsettled"), StepChanged(0, ID[3], "done")], True),
         ([Skipped(0, ID[3])], True),
     ],
 )
 def test_a_chamber_counts_as_unsettled_after_a_soak_that_ended_so_or_was_left_out(entries, is_unsettled):
     guaranteed = tuple(dataclasses.replace(each, step=Soak(100.0)) if each.index == 3 else each for each in PLAN)
-    before = [Step(0, each, "done") for each in ID[:3]]
+    before = [StepChanged(0, each, "done") for each in ID[:3]]
     assert fold(guaranteed, [*before, *entries]).is_unsettled is is_unsettled

@@ -60,7 +60,7 @@ from thermostand.stand.running.memory.entries import (
     Readying,
     Restored,
     Skipped,
-    Step,
+    StepChanged,
     Taken,
     Tripped,
 )
@@ -96,13 +96,17 @@ MOVE, START, SOAK, OPEN, CAPTURE, OFF, COOL, PROMPT, ON, WARM, HOME = (
 )
 
 
-def done(index: int) -> list[Step]:
+def done(index: int) -> list[StepChanged]:
     """All steps before that place."""
-    return [entry for step_id in ID[:index] for entry in (Step(0, step_id, "started"), Step(0, step_id, "done"))]
+    return [
+        entry
+        for step_id in ID[:index]
+        for entry in (StepChanged(0, step_id, "started"), StepChanged(0, step_id, "done"))
+    ]
 
 
-def begun(step_id: str) -> list[Step]:
-    return [*done(ID.index(step_id)), Step(0, step_id, "started")]
+def begun(step_id: str) -> list[StepChanged]:
+    return [*done(ID.index(step_id)), StepChanged(0, step_id, "started")]
 
 
 # By name: the entries so far, all at 0 s. `now` is 20 s.
@@ -269,10 +273,10 @@ def test_a_capture_that_was_killed_and_stood_for_a_minute_is_taken_again():
         (Restored(85 * S, 1), OpenAgain),
         ({"flap_open": True}, Begin),
         (Readying(86 * S, False), Begin),
-        (Step(87 * S, CAPTURE, "started"), Aim),
+        (StepChanged(87 * S, CAPTURE, "started"), Aim),
         (Due(88 * S, 88 * S), TakeAgain),
         (Again(90 * S, [CAPTURE]), TakeFrame),
-        (Step(90 * S, CAPTURE, "started"), TakeFrame),
+        (StepChanged(90 * S, CAPTURE, "started"), TakeFrame),
         (Taken(91 * S, CAPTURE), TakeFrame),
         (Due(91 * S, 98 * S), Sleep),
         ({"now_ns": 98 * S}, TakeFrame),
@@ -289,7 +293,7 @@ def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_hol
         ({"held": False}, TakeAgain),
         (Again(30 * S, [CAPTURE]), TakeFrame),
         ({"frames_lost": 0}, TakeFrame),
-        (Step(30 * S, CAPTURE, "started"), TakeFrame),
+        (StepChanged(30 * S, CAPTURE, "started"), TakeFrame),
         (Taken(31 * S, CAPTURE), TakeFrame),
         (Taken(41 * S, CAPTURE), Complete),
     )
@@ -299,16 +303,16 @@ def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_hol
 def test_a_capture_is_taken_again_three_times_for_lost_frames_also_when_it_is_resumed_meanwhile():
     """A disk that loses frames each time does not hold the night for good."""
     around = Surroundings(30 * S, flap_open=True, frames_lost=1)
-    again = [Again(30 * S, [CAPTURE], 1), Step(30 * S, CAPTURE, "started"), *[Taken(31 * S, CAPTURE)] * 2]
+    again = [Again(30 * S, [CAPTURE], 1), StepChanged(30 * S, CAPTURE, "started"), *[Taken(31 * S, CAPTURE)] * 2]
     entries = [*STATES["all frames"], *again, *again, Gap(32 * S, 33 * S), Restored(34 * S, 1)]
-    twice = fold(PLAN, [*entries, Step(35 * S, CAPTURE, "started")])
+    twice = fold(PLAN, [*entries, StepChanged(35 * S, CAPTURE, "started")])
     assert next_action(twice, around) == TakeAgain(PLAN[5], "the disk has lost 1 of its frames", 1)
     thrice = after(twice, Again(36 * S, [CAPTURE], 1))
     assert isinstance(next_action(fold(PLAN, []), around), Begin)
     for entry in again[1:]:
         thrice = after(thrice, entry)
     assert isinstance(next_action(thrice, around), Complete)
-    done = after(thrice, Step(40 * S, CAPTURE, "done"))
+    done = after(thrice, StepChanged(40 * S, CAPTURE, "done"))
     assert (thrice.taken_again, done.taken_again) == ({CAPTURE: 3}, {})
 
 
@@ -364,9 +368,9 @@ def test_a_step_that_is_left_out_ends_what_is_under_way_only_when_that_is_it():
 
 
 def test_the_end_of_a_step_ends_what_is_under_way_only_when_that_is_it():
-    state = fold(PLAN, [*STATES["one was lost"], Step(0, WARM, "done")])
+    state = fold(PLAN, [*STATES["one was lost"], StepChanged(0, WARM, "done")])
     assert (state.under_way, state.due_ns, state.is_lost) == (CAPTURE, 20 * S, True)
-    state = after(state, Step(0, CAPTURE, "done"))
+    state = after(state, StepChanged(0, CAPTURE, "done"))
     assert (state.under_way, state.due_ns, state.is_lost) == ("", None, False)
 
 
@@ -407,8 +411,8 @@ def test_a_trip_stays_until_it_is_cleared_and_an_end_until_the_run_goes_on():
 def test_a_soak_longer_than_its_time_and_one_that_was_lost_owe_what_they_say():
     state = fold(PLAN, STATES["half soaked"])
     assert state.owed_ns(PLAN[3]) == 150 * S  # it may take twice its time
-    assert after(state, Step(0, SOAK, "done")).owed_ns(PLAN[3]) == 0
-    assert after(after(state, Step(0, SOAK, "done")), Dwell(0, SOAK, 0.0)).owed_ns(PLAN[3]) == 200 * S
+    assert after(state, StepChanged(0, SOAK, "done")).owed_ns(PLAN[3]) == 0
+    assert after(after(state, StepChanged(0, SOAK, "done")), Dwell(0, SOAK, 0.0)).owed_ns(PLAN[3]) == 200 * S
     settled = next(number_steps([SoakUntilSettled(900.0, 60.0, 240.0, 60.0, 0.2, 0.003, 0.1, 24.0)]))
     assert fold([settled], []).owed_ns(settled) == 900 * S
 

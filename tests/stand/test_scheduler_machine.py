@@ -33,7 +33,7 @@ from thermostand.recording.format.journal_lines import lines_of
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from thermostand.stand.running.executing.actions import CREDITED_WITHIN_K
-from thermostand.stand.running.memory.entries import Again, Dwell, Step, decoded
+from thermostand.stand.running.memory.entries import Again, Dwell, StepChanged, decoded
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.opening.stop import Interrupted
 
@@ -274,7 +274,7 @@ class RunMachine(RuleBasedStateMachine):
                 passed_s = (entry.time_ns - last_ns.get(entry.step_id, 0)) / NS_PER_S
                 assert entry.earned_s == 0.0 or gained_s <= passed_s + 1e-6
                 earned_s[entry.step_id], last_ns[entry.step_id] = entry.earned_s, entry.time_ns
-            if isinstance(entry, Step) and entry.state == "done" and entry.step_id in SOAKS_S:
+            if isinstance(entry, StepChanged) and entry.state == "done" and entry.step_id in SOAKS_S:
                 assert earned_s[entry.step_id] == SOAKS_S[entry.step_id]
 
     @invariant()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tests.addresses import usual_camera_address
 from tests.still_plant import StillPlant
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
 from thermostand.foundation.clock import NS_PER_S, FollowedClock, VirtualClock, WallClock
@@ -51,8 +51,8 @@ def settings(**changes: object) -> GigeCameraSettings:
 
 
 @asynccontextmanager
-async def opened(clock: WallClock | VirtualClock | None = None, **changes: object) -> AsyncGenerator[Camera]:
-    camera = Camera("camera", settings(**changes), clock or WallClock())
+async def opened(clock: WallClock | VirtualClock | None = None, **changes: object) -> AsyncGenerator[AravisCamera]:
+    camera = AravisCamera("camera", settings(**changes), clock or WallClock())
     try:
         await camera.open()
         yield camera

@@ -18,7 +18,7 @@ from tests.system.camera_bench import (
     virtual,
 )
 from tests.system.conftest import require_aravis
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.wires import camera_connection
 from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
@@ -105,7 +105,7 @@ async def test_after_a_power_cycle_open_makes_everything_new(fake: FakeCamera, p
         "offset_x_px": 16,
         "packet_size": 4000,
     }
-    camera = Camera("camera", settings(**asked, packet_delay_ns=1000, heartbeat_s=2.5), clock)
+    camera = AravisCamera("camera", settings(**asked, packet_delay_ns=1000, heartbeat_s=2.5), clock)
     await camera.open()
     before, had = await camera.grab(), camera.effective
     for on in (False, True):
@@ -127,7 +127,7 @@ async def test_after_a_power_cycle_open_makes_everything_new(fake: FakeCamera, p
 
 
 async def test_a_camera_that_returns_without_a_stream_channel_is_unreachable_until_it_has_one(fake: FakeCamera):
-    camera = Camera("camera", settings(), WallClock())
+    camera = AravisCamera("camera", settings(), WallClock())
     await camera.open()
     await camera.grab()
     await camera.stop()
@@ -144,7 +144,7 @@ async def test_a_camera_that_returns_without_a_stream_channel_is_unreachable_unt
     await camera.close()
 
 
-async def why_unreachable(camera: Camera) -> str:
+async def why_unreachable(camera: AravisCamera) -> str:
     try:
         await camera.read()
     except Unreachable as error:
@@ -173,7 +173,7 @@ async def test_a_camera_that_froze_past_its_heartbeat_is_lost_and_comes_back(fak
 @pytest.mark.usefixtures("fake")
 async def test_while_another_client_controls_the_camera_open_is_refused():
     async with opened():
-        other = Camera("other", settings(), WallClock())
+        other = AravisCamera("other", settings(), WallClock())
         with pytest.raises(Refused, match="another client controls"):
             await other.open()
         await other.close()

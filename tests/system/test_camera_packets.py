@@ -8,7 +8,7 @@ import pytest
 
 from tests.still_plant import StillPlant
 from tests.system.camera_bench import noise, opened, simulated, virtual
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvsp_sender import StreamSender
 from thermostand.drivers.wires import camera_connection
@@ -29,7 +29,7 @@ def is_right(frame: Frame) -> bool:
     return bool((frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)).all())
 
 
-async def grabbed(camera: Camera, clock: VirtualClock, count: int = FRAMES) -> list[Frame]:
+async def grabbed(camera: AravisCamera, clock: VirtualClock, count: int = FRAMES) -> list[Frame]:
     frames = list[Frame]()
     for _ in range(count):
         frames.append(await camera.grab())

@@ -19,7 +19,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.guarding.rules import camera_measured
-from thermostand.stand.running.memory.entries import Again, Step
+from thermostand.stand.running.memory.entries import Again, StepChanged
 from thermostand.stand.running.memory.fold import after, fold
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
@@ -142,11 +142,11 @@ def test_no_temperature_is_asked_of_a_camera_that_is_off_lost_or_has_taken_its_l
 def test_frames_are_to_come_until_the_last_capture_of_the_plan_is_done():
     capture = Capture(1, 1.0, 0.1, Role.CALIBRATION, 20.0)
     plan = [PlannedStep(0, "a", Soak(1.0)), PlannedStep(1, "b", capture), PlannedStep(2, "c", capture)]
-    state = fold(plan, [Step(0, "a", "done"), Step(0, "b", "done")])
+    state = fold(plan, [StepChanged(0, "a", "done"), StepChanged(0, "b", "done")])
     assert state.frames_to_come
-    state = after(state, Step(0, "c", "started"))
+    state = after(state, StepChanged(0, "c", "started"))
     assert state.frames_to_come
-    state = after(state, Step(0, "c", "done"))
+    state = after(state, StepChanged(0, "c", "done"))
     assert not state.frames_to_come
     assert after(state, Again(0, ["c"])).frames_to_come
     assert not after(state, Again(0, ["a"])).frames_to_come

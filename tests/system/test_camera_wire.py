@@ -19,7 +19,7 @@ from tests.system.camera_bench import (
     virtual,
 )
 from tests.system.conftest import require_aravis
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.wires.camera_settings import TemperatureFeature
 from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
@@ -36,7 +36,7 @@ def aravis() -> None:
 async def test_another_camera_at_the_address_of_the_first_gets_no_setting(plant: StillPlant, wanted: str | None):
     """Control is taken, which Aravis does when it opens one; nothing else is written."""
     with simulated(WallClock(), plant):
-        camera = Camera("camera", settings(serial_number=wanted), WallClock())
+        camera = AravisCamera("camera", settings(serial_number=wanted), WallClock())
         await camera.open()
     with simulated(WallClock(), plant, "C9999") as stranger:
         before = {name: stranger._registers.integer(name) for name in ("GevSCPSPacketSize", "GevSCPD", "PixelFormat")}

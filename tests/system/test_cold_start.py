@@ -23,7 +23,7 @@ from thermostand.foundation.readings import Frame
 from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.executing.actions import cold_start
-from thermostand.stand.running.memory.entries import Step
+from thermostand.stand.running.memory.entries import StepChanged
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption
@@ -69,7 +69,9 @@ def test_a_warm_up_that_was_killed_begins_again_from_a_cold_camera(tmp_path: Pat
 
 def again(plan, done, begun):
     """What is done again of a warm-up that was interrupted when so much was done and begun."""
-    entries = [Step(0, step_id, "started") for step_id in begun] + [Step(0, step_id, "done") for step_id in done]
+    entries = [StepChanged(0, step_id, "started") for step_id in begun] + [
+        StepChanged(0, step_id, "done") for step_id in done
+    ]
     return cold_start(fold(plan, entries))
 
 

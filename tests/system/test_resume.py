@@ -25,7 +25,7 @@ from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session
-from thermostand.stand.running.memory.entries import Dwell, Gap, Step
+from thermostand.stand.running.memory.entries import Dwell, Gap, StepChanged
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import Interruption, interruption
@@ -121,7 +121,7 @@ def check_soaks(directory: Path, order: Order) -> None:
             gained_s = entry.earned_s - earned_s.get(entry.step_id, 0.0)
             assert entry.earned_s == 0.0 or 0.0 <= gained_s <= 60.0 + 1e-9
             earned_s[entry.step_id] = entry.earned_s
-        if isinstance(entry, Step) and entry.state == "done" and entry.step_id in earned_s:
+        if isinstance(entry, StepChanged) and entry.state == "done" and entry.step_id in earned_s:
             assert earned_s[entry.step_id] == durations_s[entry.step_id]
     assert earned_s == {step_id: duration_s for step_id, duration_s in durations_s.items() if duration_s}
 

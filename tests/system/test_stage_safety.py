@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.drivers.devices.cameras.camera_gige import Camera
+from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.devices.motion.flap import Flap
 from thermostand.drivers.devices.motion.stage import Axis, AxisSettings
 from thermostand.drivers.devices.regulators.regulator import Regulator
@@ -179,7 +179,7 @@ def stand_with(axis: Axis, clock: Clock) -> Stand:
     maps = [load_register_map(packaged("registers", name)) for name in ("omron-e5cc", "waveshare-relay")]
     relays = Relays("relays", bus, maps[1], {"heater_enable": 0, "compressor": 1, "camera_power": 2})
     regulator, flap = Regulator("regulator", bus, maps[0], clock), Flap("flap", FLAP, clock, None)
-    camera = Camera("camera", GigeCameraSettings(address="127.0.0.1"), clock)
+    camera = AravisCamera("camera", GigeCameraSettings(address="127.0.0.1"), clock)
     thermometers = Thermometers("thermometers", bus, maps[0], {}, clock)
     chamber = ChamberLimits((-10.0, 60.0), PermitLimits(15.0, 3.0, CompressorConfig()), 5.0)
     every = {each.name: each for each in (regulator, relays, thermometers, flap, axis, camera)}

@@ -31,7 +31,7 @@ ATTEMPTS = 3  # frames in a row that may fail before the camera counts as lost
 _CLOCK_SLACK_S = 1.0  # its clock is read that well, and it is heard for longer than that before it may be lost
 
 
-class Camera:
+class AravisCamera:
     """A GigE or USB3 Vision camera under `name`; channels `<name>.image` and `<name>.temperature`."""
 
     def __init__(self, name: str, settings: AravisCameraSettings, clock: Clock) -> None:
@@ -226,3 +226,6 @@ class Camera:
         self._lost = ""
         if connection is not None:
             connection.close()
+
+
+Camera = AravisCamera

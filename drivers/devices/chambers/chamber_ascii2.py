@@ -71,7 +71,7 @@ class Ascii2Settings(ChamberUnitSettings):
 Settings = Ascii2Settings
 
 
-class Language(ChamberLanguage):
+class Ascii2Language(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
     in_force_by = "the nominal value in the reply to I, which a program moves"
@@ -153,3 +153,6 @@ class Language(ChamberLanguage):
 
 def _bit(digits: str, index: int) -> bool:
     return index < len(digits) and digits[index] == "1"
+
+
+Language = Ascii2Language

@@ -72,7 +72,7 @@ class CtsSettings(ChamberUnitSettings):
 Settings = CtsSettings
 
 
-class Language(ChamberLanguage):
+class CtsLanguage(ChamberLanguage):
     """One CTS chamber."""
 
     not_told = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
@@ -175,3 +175,6 @@ def _door_open(text: str) -> bool | None:
 
 def _expecting(word: str) -> Callable[[str], str | None]:
     return lambda text: word if text == word else None
+
+
+Language = CtsLanguage

@@ -48,7 +48,7 @@ class EspecSettings(ChamberUnitSettings):
 Settings = EspecSettings
 
 
-class Language(ChamberLanguage):
+class EspecLanguage(ChamberLanguage):
     """One ESPEC chamber."""
 
     in_force_by = "TEMP? tells the set-point that acts, MON? whether a program runs"
@@ -153,3 +153,6 @@ class Language(ChamberLanguage):
 
     def _bytes(self, command: str) -> bytes:
         return f"{self._prefix}{command}\r\n".encode("ascii")
+
+
+Language = EspecLanguage

@@ -82,7 +82,7 @@ class JulaboSettings(ChamberUnitSettings):
 Settings = JulaboSettings
 
 
-class Language(ChamberLanguage):
+class JulaboLanguage(ChamberLanguage):
     """One circulator."""
 
     def __init__(self, name: str, settings: JulaboSettings) -> None:
@@ -178,3 +178,6 @@ class Language(ChamberLanguage):
         if code in _ABOUT_A_COMMAND:
             hint = f"; {_BY_HAND}" if code == "-09" else ""
             raise Refused(self._name, f"{command}: {code} {words}{hint}")
+
+
+Language = JulaboLanguage

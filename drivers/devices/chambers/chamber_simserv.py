@@ -73,7 +73,7 @@ class SimservSettings(ChamberUnitSettings):
 Settings = SimservSettings
 
 
-class Language(ChamberLanguage):
+class SimservLanguage(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
     in_force_by = "11002 tells the set-point, 10010 whether a program runs, 11066 and 11070 whether a gradient is set"
@@ -174,3 +174,6 @@ class Language(ChamberLanguage):
     def _request(self, command: int, arguments: tuple[object, ...]) -> bytes:
         words = [str(command), str(self._settings.chamber), *map(str, arguments)]
         return (_MARK.join(words) + "\r").encode("latin-1")
+
+
+Language = SimservLanguage

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.drivers.devices.imager.radiometry import Air, Planck, Surroundings
+from thermostand.drivers.devices.imager.radiometry import Air, Planck, RadiometricSurroundings
 from thermostand.foundation.image_limit import size_fault
 
 _START, _END = b"\xff\xd8", b"\xff\xd9"
@@ -39,7 +39,7 @@ class RadiometricImage:
 
     counts: NDArray[np.uint16]
     planck: Planck
-    around: Surroundings
+    around: RadiometricSurroundings
     emissivity: float
     model: str
     serial_number: str
@@ -136,7 +136,7 @@ def _parsed(records: Mapping[int, tuple[int, bytes]]) -> RadiometricImage:
     if not (planck.R1 > 0 and planck.R2 > 0 and planck.B > 0):
         raise NotRadiometric(f"its constants are R1 {planck.R1:g}, R2 {planck.R2:g}, B {planck.B:g}")
     air = Air(real(36), real(44), real(60), real(112), real(116), real(120), real(124), real(128))
-    around = Surroundings(air, real(40), real(48), real(52))
+    around = RadiometricSurroundings(air, real(40), real(48), real(52))
     seconds, milliseconds = struct.unpack_from("<II", info, 900)
     spots = _spots(records[_MEASUREMENTS][1]) if _MEASUREMENTS in records else {}
     names = text(212, 32), text(260, 16), text(276, 16)

@@ -71,7 +71,7 @@ class Air:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class RadiometricSurroundings:
     """What else reaches the sensor: what the object reflects, and a window."""
 
     air: Air
@@ -81,7 +81,7 @@ class Surroundings:
 
 
 def temperatures_degC(
-    raw: NDArray[np.uint16], planck: Planck, around: Surroundings, emissivity: float
+    raw: NDArray[np.uint16], planck: Planck, around: RadiometricSurroundings, emissivity: float
 ) -> NDArray[np.float64]:
     """Of a surface with this emissivity (0..1], in degC, shape of `raw`; NaN where the formula has no answer."""
     tau, tw = around.air.transmission, around.window_transmission

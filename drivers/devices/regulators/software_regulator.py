@@ -58,6 +58,7 @@ class SoftwareRegulator:
         self,
         name: str,
         settings: SoftwareRegulatorSettings,
+        *,
         heat: HeatOutput,
         measured: Callable[[], Reading | None],
         allowed_degC: tuple[float, float],
@@ -283,12 +284,12 @@ def _make(name: str, settings: SoftwareRegulatorSettings, around: Around) -> Sof
     return SoftwareRegulator(
         name,
         settings,
-        module if isinstance(module, HeatModule) else HeatPulses(relays, settings.pulses, around.clock),
-        lambda: around.known(f"thermometers.{settings.thermometer}"),
-        around.of_section("limits").chamber_degC,
-        around.of_section("guard").stale_after_s,
-        around.clock,
-        around.publish,
+        heat=module if isinstance(module, HeatModule) else HeatPulses(relays, settings.pulses, around.clock),
+        measured=lambda: around.known(f"thermometers.{settings.thermometer}"),
+        allowed_degC=around.of_section("limits").chamber_degC,
+        stale_s=around.of_section("guard").stale_after_s,
+        clock=around.clock,
+        publish=around.publish,
     )
 
 

@@ -18,8 +18,8 @@ from thermostand.experiments.steps import (
     Decide,
     PlannedStep,
     Role,
+    Step,
 )
-from thermostand.experiments.steps import Step as PlanStep
 from thermostand.foundation.clock import NS_PER_S, Clock
 from thermostand.foundation.errors import ConfigError, DeviceError, Superseded
 from thermostand.foundation.events import (
@@ -73,7 +73,7 @@ from thermostand.stand.running.memory.entries import (
     Readying,
     Restored,
     Skipped,
-    Step,
+    StepChanged,
     Taken,
     data_of,
     edited,
@@ -181,7 +181,7 @@ class Executor:
         """Soak for so much longer; else as `skip`."""
         await self._change(Extended(self._clock.now_ns(), step_id, by_s))
 
-    async def edit(self, from_index: int, steps: Sequence[PlanStep]) -> None:
+    async def edit(self, from_index: int, steps: Sequence[Step]) -> None:
         """Replace the steps from the place `from_index` on, none of which was begun; else as `skip`."""
         await self._change(edited(self._clock.now_ns(), from_index, steps))
 
@@ -271,7 +271,7 @@ class Executor:
             case OpenAgain():
                 await stand.imaging.open_flap()
             case Begin(planned):
-                await self._log.write(Step(self._clock.now_ns(), planned.step_id, "started"))
+                await self._log.write(StepChanged(self._clock.now_ns(), planned.step_id, "started"))
                 self._mark(planned, StepState.STARTED)
             case Aim(capture):
                 await self._aim(capture)
@@ -295,7 +295,7 @@ class Executor:
             case Complete(planned) | Perform(planned) if planned.step_id == self._state.under_way:
                 self._mark(planned, StepState.DONE)
                 await self._flushed()
-                await self._log.write(Step(self._clock.now_ns(), planned.step_id, "done"))
+                await self._log.write(StepChanged(self._clock.now_ns(), planned.step_id, "done"))
             case StartCold(again):
                 if planned := self._state.step(self._state.under_way):
                     self._mark(planned, StepState.FAILED)

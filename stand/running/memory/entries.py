@@ -1,26 +1,26 @@
 """What happens to a run, entry by entry. RunState is folded from them; those that outlive the daemon are lines of its
 journal (recording/reading/journal_lines.py).
 
-    Begun     the run, its plan and the texts it was made of; the first line and no other
-    Step      a step was started, or is done
-    Dwell     what a soak has earned so far
-    Held      a reason to wait appeared or went
-    Gap       nothing ran between two instants
-    Again     steps that were done are to be done again
-    Skipped   a step is left out, or broken off, by an operator
-    Extended  a soak is made longer by an operator
-    Edited    the steps from a place on are replaced, by an operator or by the plan's own decision
-    Tripped   the guard has made the stand safe, and why
-    Cleared   an operator has removed the cause of a trip
-    Ended     complete, stopped by the operator, tripped, or failed
+    Begun        the run, its plan and the texts it was made of; the first line and no other
+    StepChanged  a step was started, or is done
+    Dwell        what a soak has earned so far
+    Held         a reason to wait appeared or went
+    Gap          nothing ran between two instants
+    Again        steps that were done are to be done again
+    Skipped      a step is left out, or broken off, by an operator
+    Extended     a soak is made longer by an operator
+    Edited       the steps from a place on are replaced, by an operator or by the plan's own decision
+    Tripped      the guard has made the stand safe, and why
+    Cleared      an operator has removed the cause of a trip
+    Ended        complete, stopped by the operator, tripped, or failed
 
 Not written: what the recording proves (Taken, Cooled), and what a Gap makes void (Due, Readying, Restored).
 
-    Taken     a capture has a frame more
-    Due       when the capture's next frame is due
-    Readying  the stand is being made ready for the next step, or is
-    Restored  the set-up of the steps so far has been brought about again
-    Cooled    the camera was or may have been off
+    Taken        a capture has a frame more
+    Due          when the capture's next frame is due
+    Readying     the stand is being made ready for the next step, or is
+    Restored     the set-up of the steps so far has been brought about again
+    Cooled       the camera was or may have been off
 
 Instants are ns on the stand's clock, so a run in virtual time has the same journal each time.
 """
@@ -35,7 +35,7 @@ from typing import Literal, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from thermostand.experiments.steps import Step as PlanStep
+from thermostand.experiments.steps import Step
 from thermostand.foundation.document_faults import path_text
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
@@ -54,7 +54,7 @@ class Begun:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StepChanged:
     """A step of the plan; "done" is written when all it has recorded is on the disk."""
 
     time_ns: int
@@ -197,17 +197,17 @@ class Cooled:
     time_ns: int
 
 
-Written = Begun | Step | Dwell | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Cleared | Ended
+Written = Begun | StepChanged | Dwell | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Cleared | Ended
 Entry = Written | Taken | Due | Readying | Restored | Cooled
 Change = Skipped | Extended | Edited  # of the plan
 
-_WRITTEN: dict[str, type[Written]] = {
-    kind.__name__: kind
-    for kind in (Begun, Step, Dwell, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Cleared, Ended)
+_WRITTEN: dict[str, type[Written]] = {"Step": StepChanged} | {
+    kind.__name__: kind for kind in (Begun, Dwell, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Cleared, Ended)
 }
+_NAMES = {kind: name for name, kind in _WRITTEN.items()}
 
 
-def edited(time_ns: int, from_index: int, steps: Iterable[PlanStep], decided: str = "", reason: str = "") -> Edited:
+def edited(time_ns: int, from_index: int, steps: Iterable[Step], decided: str = "", reason: str = "") -> Edited:
     """The steps from a place on replaced by these."""
     by: list[dict[str, object]] = [{"kind": step.kind, "parameters": step.parameters} for step in steps]
     return Edited(time_ns, from_index, by, decided, reason)
@@ -237,7 +237,7 @@ def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
 
 def encoded(entry: Written) -> bytes:
     """What its line says."""
-    return json.dumps({"entry": type(entry).__name__, **asdict(entry)}).encode()
+    return json.dumps({"entry": _NAMES[type(entry)], **asdict(entry)}).encode()
 
 
 def decoded(text: bytes) -> Written:

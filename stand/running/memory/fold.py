@@ -38,7 +38,7 @@ from thermostand.stand.running.memory.entries import (
     Readying,
     Restored,
     Skipped,
-    Step,
+    StepChanged,
     Taken,
     Tripped,
 )
@@ -55,7 +55,7 @@ def after(state: RunState, entry: Entry) -> RunState:
     """What the state is after one more entry. What does not fit, such as a change of a step that is done, changes
     nothing."""
     match entry:
-        case Step():
+        case StepChanged():
             return _begun(state, entry) if entry.state == "started" else _done(state, entry)
         case Dwell(_, step_id, earned_s, ended):
             if step_id in state.skipped:
@@ -177,7 +177,7 @@ def _placed(state: RunState) -> RunState:
     return replace(state, index=index, set_up=set_up)
 
 
-def _begun(state: RunState, entry: Step) -> RunState:
+def _begun(state: RunState, entry: StepChanged) -> RunState:
     """A camera that the plan switches is seen from then on: what follows in the plan is made for that."""
     is_first = state.under_way != entry.step_id
     state = replace(
@@ -193,7 +193,7 @@ def _begun(state: RunState, entry: Step) -> RunState:
     return replace(_seen(state, entry.time_ns), was_held=False, is_cold=False)
 
 
-def _done(state: RunState, entry: Step) -> RunState:
+def _done(state: RunState, entry: StepChanged) -> RunState:
     is_under_way = state.under_way == entry.step_id
     return _placed(
         replace(
