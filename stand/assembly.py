@@ -206,7 +206,9 @@ def device_kinds(config: StandConfig) -> dict[str, str]:
 def recorded_devices(config: StandConfig) -> dict[str, RecordedDevice]:
     """What is recorded of each device that is read, by name; ConfigError when one declares what cannot be recorded."""
     return {
-        each.name: RecordedDevice(each.kind.name, each.channels(partial(getattr, config), register_map))
+        each.name: RecordedDevice(
+            each.kind.name, each.channels(partial(getattr, config), register_map), each.kind.is_opened
+        )
         for each in config.equipment
         if each.poll_s is not None
     }

@@ -27,17 +27,20 @@ from thermostand.foundation.readings import Channel, Quality, Reading
 from thermostand.recording.format import messages
 
 READINGS = "/readings/"  # with the device's name: its topic
-_DEVICE, _KIND, _CHANNELS = "device", "kind", "channels"  # keys of a topic's metadata
+_DEVICE, _KIND, _CHANNELS, _OPENED = "device", "kind", "channels", "opened"  # keys of a topic's metadata
+_BY_USE = "by what uses it"  # the value of the last; there is none for a device that is opened with the stand
 _UNIT_WORDS = {"%": "percent", "1": "", "": ""}
 _DEVICE_NAME = re.compile(r"[a-z][a-z0-9_]{0,60}")
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedDevice:
-    """What is recorded of a device: its kind, and what it measures."""
+    """What is recorded of a device: its kind, and what it measures. is_opened: with the stand, and so read in each run;
+    else by what uses it."""
 
     kind: str
     channels: tuple[Channel, ...]
+    is_opened: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +65,8 @@ class BatchForm:
         """Of its topic: what `form_of` makes the form of again."""
         channels = [[each.name, each.unit, each.kind] for each in self.device.channels]
         text = json.dumps(channels, ensure_ascii=False, separators=(",", ":"))
-        return {_DEVICE: self.name, _KIND: self.device.kind, _CHANNELS: text}
+        opened = {} if self.device.is_opened else {_OPENED: _BY_USE}
+        return {_DEVICE: self.name, _KIND: self.device.kind, _CHANNELS: text, **opened}
 
     def encode(self, batch: Batch) -> bytes:
         """The batch as one message; nothing of a reading is lost, for any channel, unit or time."""
@@ -121,11 +125,11 @@ def batch_form(name: str, device: RecordedDevice) -> BatchForm:
 
 def form_of(metadata: Mapping[str, str]) -> BatchForm:
     """The form of a recorded topic, by its metadata; ValueError when they do not say it."""
-    return _form_of(*(metadata.get(key, "") for key in (_DEVICE, _KIND, _CHANNELS)))
+    return _form_of(*(metadata.get(key, "") for key in (_DEVICE, _KIND, _CHANNELS, _OPENED)))
 
 
 @lru_cache(256)
-def _form_of(name: str, kind: str, text: str) -> BatchForm:
+def _form_of(name: str, kind: str, text: str, opened: str) -> BatchForm:
     if not _DEVICE_NAME.fullmatch(name):
         raise ValueError(f"{name!r} is not the name of a device")
     channels: object = json.loads(text)
@@ -136,7 +140,7 @@ def _form_of(name: str, kind: str, text: str) -> BatchForm:
         if not isinstance(each, list) or [type(part) for part in cast("list[object]", each)] != [str, str, str]:
             raise ValueError(f"{each!r} is not a channel of {name}")
         found.append(Channel(*cast("list[str]", each)))
-    return batch_form(name, RecordedDevice(kind, tuple(found)))
+    return batch_form(name, RecordedDevice(kind, tuple(found), is_opened=opened != _BY_USE))
 
 
 def fields_of(channels: Iterable[Channel]) -> tuple[str, ...]:
@@ -154,6 +158,12 @@ def fields_of(channels: Iterable[Channel]) -> tuple[str, ...]:
         taken |= {field, f"{field}_quality"}
         fields.append(field)
     return tuple(fields)
+
+
+def name_apart(channel: str, unit: str, first: str) -> str:
+    """What a channel is called in a session in which it was recorded in the unit `first` before: its name, or with
+    another unit `lab.pressure (mbar)`."""
+    return channel if unit == first else f"{channel} ({unit})"
 
 
 def unit_word(unit: str) -> str:

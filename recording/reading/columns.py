@@ -20,7 +20,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Batch
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchForm
+from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchForm, name_apart
 from thermostand.recording.format.records import RecordedMessage
 
 if TYPE_CHECKING:
@@ -108,10 +108,9 @@ class ReadingColumns:
 
     def _named(self, channel: str, unit: str) -> str:
         """What a channel is called that is read in this unit."""
-        if self.units.setdefault(channel, unit) == unit:
-            return channel
-        self.units[f"{channel} ({unit})"] = unit
-        return f"{channel} ({unit})"
+        name = name_apart(channel, unit, self.units.setdefault(channel, unit))
+        self.units[name] = unit
+        return name
 
     def _add_singly(self, batch: Batch) -> None:
         for reading in batch.readings:

@@ -33,15 +33,16 @@ class RunStep:
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureRange:
-    """One channel in degC; min, mean and max are NaN when every reading was BAD."""
+class ChannelRange:
+    """One channel, in its unit; min, mean and max are NaN when every reading was BAD."""
 
     channel: str
+    unit: str
     count: int
     bad: int
-    min_degC: float
-    mean_degC: float
-    max_degC: float
+    min: float
+    mean: float
+    max: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class Overview:
     scanned: Scan
     steps: tuple[RunStep, ...]
     frames: FramesSummary
-    temperatures: tuple[TemperatureRange, ...]
+    channels: tuple[ChannelRange, ...]
     gaps: tuple[Silence, ...]
     events: tuple[Event, ...]
 
@@ -93,7 +94,7 @@ def overview(path: Path) -> Overview:
         found,
         tuple(_steps(recorded)),
         _frames(found),
-        tuple(_temperature(name, channel) for name, channel in sorted(recorded.channels.items()) if channel.is_degC),
+        tuple(_range(name, channel) for name, channel in sorted(recorded.channels.items())),
         tuple(silences(times_ns)),
         tuple(sorted(recorded.events, key=lambda event: event.time_ns)),
     )
@@ -142,10 +143,8 @@ def _frames(found: Scan) -> FramesSummary:
     )
 
 
-def _temperature(name: str, channel: ChannelReadings) -> TemperatureRange:
+def _range(name: str, channel: ChannelReadings) -> ChannelRange:
     values = np.array(channel.values, np.float64)
     good = values[~np.isnan(values)]
-    bad = len(values) - len(good)
-    if not len(good):
-        return TemperatureRange(name, len(values), bad, np.nan, np.nan, np.nan)
-    return TemperatureRange(name, len(values), bad, float(good.min()), float(good.mean()), float(good.max()))
+    ends = (float(good.min()), float(good.mean()), float(good.max())) if len(good) else (np.nan, np.nan, np.nan)
+    return ChannelRange(name, channel.unit, len(values), len(values) - len(good), *ends)

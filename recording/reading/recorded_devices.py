@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from mcap.records import Channel
@@ -22,7 +23,7 @@ def recorded_devices(telemetry: Iterable[Path]) -> dict[str, RecordedDevice]:
             before = found[form.name].channels if form.name in found else ()
             known = [(each.name, each.unit) for each in before]
             added = (each for each in form.device.channels if (each.name, each.unit) not in known)
-            found[form.name] = RecordedDevice(form.device.kind, (*before, *added))
+            found[form.name] = replace(form.device, channels=(*before, *added))
     return found
 
 

@@ -36,8 +36,10 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import FRAMES_DROPPED, RUN_BEGINS, RUN_END, TELL_PLAN
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.recording.format import messages
+from thermostand.recording.format.batches import READINGS, name_apart
 from thermostand.recording.format.damage import DAMAGE
 from thermostand.recording.format.holes import Hole, holes_in, segments_text
+from thermostand.recording.format.images import frame_topics
 from thermostand.recording.format.inventory import (
     MOST_MISSING,
     SegmentFile,
@@ -123,11 +125,6 @@ class ChannelReadings:
     times_ns: array[int] = field(default_factory=lambda: array("q"))
     values: array[float] = field(default_factory=lambda: array("d"))
 
-    @property
-    def is_degC(self) -> bool:
-        """It is a temperature."""
-        return self.unit == "degC"
-
     def sorted_times_ns(self) -> NDArray[np.int64]:
         """The instants, ascending, shape (n,)."""
         return np.sort(np.array(self.times_ns, np.int64))
@@ -147,6 +144,9 @@ class Recorded:
         if message.form is not None:
             for reading in message.form.decode(message.data, message.time_ns).readings:
                 channel = self.channels.setdefault(reading.channel, ChannelReadings(reading.unit))
+                if channel.unit != reading.unit:
+                    name = name_apart(reading.channel, reading.unit, channel.unit)
+                    channel = self.channels.setdefault(name, ChannelReadings(reading.unit))
                 channel.times_ns.append(reading.time_ns)
                 channel.values.append(reading.value)
             return
@@ -455,6 +455,7 @@ class _Look:
         yield from _of_notes(self._path)
         if self._depth is not Depth.ENDS and self._extent is None:
             yield from self._steps_without_frames()
+        yield from self._silent_devices()
         if self._depth is Depth.BYTES:
             yield from _frames_lost(self._recorded, self._utc)
             times_ns = {name: channel.sorted_times_ns() for name, channel in self._recorded.channels.items()}
@@ -462,7 +463,6 @@ class _Look:
                 yield _note(silence.text(self._utc))
             if self._has_camera_degC() is False:
                 yield _note(f"{NO_TEMPERATURE}: no drift over temperature can be fitted to them")
-            yield from self._silent_devices()
 
     def _not_finished(self) -> Iterator[SessionFinding]:
         by_name = {each.file.name: each for each in self._seen}
@@ -758,17 +758,25 @@ class _Look:
                 yield from (place.meta for place in frame_places(each.file.path))
 
     def _silent_devices(self) -> Iterator[SessionFinding]:
-        """Devices, and channels of others, that were declared and of which a complete run has no reading."""
-        if not isinstance(self._manifest, Manifest) or self._run is not RunOutcome.COMPLETE or self._extent is not None:
+        """Devices of which a complete run has no reading though they were declared; where the readings were read, also
+        channels of others. A device that is opened by what uses it, as a camera in a run without frames, may have none.
+        What may have been in a part that is damaged or missing is not looked for: that is a finding already."""
+        stated = self._manifest
+        if not isinstance(stated, Manifest) or self._run is not RunOutcome.COMPLETE or self._extent is not None:
             return
-        heard = {name.partition(".")[0] for name in self._recorded.channels}
-        for name in sorted(self._manifest.devices.keys() - heard):
-            yield _note(f"{name}: no reading of this device is recorded, though it was declared")
-        for name in sorted(self._manifest.devices.keys() & heard):
-            declared = self._manifest.devices[name].get("channels", {})
-            for channel in declared if isinstance(declared, dict) else ():
-                if channel not in self._recorded.channels:
-                    yield _note(f"{channel}: no reading of this channel is recorded, though it was declared")
+        if self._gaps(TELEMETRY) or self._lost_end or any(each.damages for each in self._of(TELEMETRY)):
+            return
+        topics = {topic for each in stated.segments.values() for topic, count in each.messages.items() if count}
+        for name, declared in sorted(stated.devices.items()):
+            if f"{READINGS}{name}" not in topics:
+                is_due = declared.get("is_opened", True) or frame_topics(f"{name}.image").image in topics
+                found = _missing_part if is_due else _note
+                yield found(f"{name}: no reading of this device is recorded, though it was declared")
+                continue
+            channels = declared.get("channels", {})
+            known = channels if isinstance(channels, dict) and self._depth >= Depth.TELEMETRY else ()
+            if silent := [channel for channel in known if channel not in self._recorded.channels]:
+                yield _missing_part(f"{', '.join(silent)}: no reading of this is recorded, though it was declared")
 
 
 def _is_utf_8(text: str) -> bool:

@@ -11,13 +11,14 @@ from mcap.writer import CompressionType
 from thermostand.foundation.clock import seconds_ns
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import BatchForm, RecordedDevice, batch_form
-from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
+from thermostand.recording.format.images import ZSTD_LEVEL
 from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.manifest import Manifest
 from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.recording.writing.segment import SeriesForm, Topic
 
+_TABLE_UNITS = ("mm", "deg")  # of the table's positions along, and around
 TELEMETRY_RESERVE_BYTES = 16_000_000  # hours of it, so that it continues when frames or others fill the disk
 
 
@@ -41,7 +42,7 @@ class SessionForm:
         settings = self.settings
         return SeriesForm(
             name=FRAMES,
-            topics=frames_topics(self.devices),
+            topics=(),
             compression=CompressionType.NONE if settings.frame_encoding == "raw" else CompressionType.ZSTD,
             session=self.metadata,
             attachments=self.attachments,
@@ -58,6 +59,7 @@ class SessionForm:
         return SeriesForm(
             name=TELEMETRY,
             topics=telemetry_topics(self.devices),
+            topic_of=_known_topic,
             compression=CompressionType.ZSTD,
             session=self.metadata,
             attachments=self.attachments,
@@ -69,28 +71,38 @@ class SessionForm:
 
 
 def declared(device: str, recorded: RecordedDevice) -> dict[str, object]:
-    """What the manifest says of a device: its kind, and its channels, each with its unit."""
-    return {"kind": recorded.kind, "channels": {f"{device}.{each.name}": each.unit for each in recorded.channels}}
+    """What the manifest says of a device: its kind, its channels, each with its unit, and whether it is opened with the
+    stand."""
+    channels = {f"{device}.{each.name}": each.unit for each in recorded.channels}
+    return {"kind": recorded.kind, "channels": channels, "is_opened": recorded.is_opened}
 
 
 def telemetry_topics(devices: Mapping[str, RecordedDevice]) -> tuple[Topic, ...]:
-    """One for the readings of each of these devices, by name, and those every session has."""
-    kinds = {device.kind for device in devices.values()}
-    names = [messages.TABLE_POSE] * ("axis" in kinds) + [messages.ORIGINAL] * ("imager" in kinds)
-    names += [messages.STEP, messages.EVENT, messages.LOG]
+    """One for the readings of each of these devices, by name, and those every session has. That of an imager's pictures
+    begins with the first of them."""
     own = (readings_topic(batch_form(name, device)) for name, device in devices.items())
-    return (*own, *(Topic(name, messages.CLASSES[name]) for name in names))
+    pose = [messages.TABLE_POSE] * (len(stages_of(devices)) == len(_TABLE_UNITS))
+    return (*own, *map(_known_topic, (*pose, messages.STEP, messages.EVENT, messages.LOG)))
+
+
+def stages_of(devices: Mapping[str, RecordedDevice]) -> dict[str, str]:
+    """Device -> channel of the table's position along, and around: the first that declares one in mm, and in deg."""
+    by_unit: dict[str, tuple[str, str]] = {}
+    for name, device in devices.items():
+        for each in device.channels:
+            if each.kind == "position" and each.unit in _TABLE_UNITS:
+                by_unit.setdefault(each.unit, (name, f"{name}.{each.name}"))
+    return dict(by_unit.values())
+
+
+def _known_topic(name: str) -> Topic:
+    """The topic of that name that is not of a device; KeyError when there is none."""
+    return Topic(name, messages.CLASSES[name])
 
 
 def readings_topic(form: BatchForm) -> Topic:
     """The topic of a device."""
     return Topic(form.topic, form.message, form.metadata)
-
-
-def frames_topics(devices: Mapping[str, RecordedDevice]) -> tuple[Topic, ...]:
-    """Of the cameras among these devices; one that is not among them gets its topics with its first frame."""
-    cameras = [name for name, device in devices.items() if device.kind == "camera"]
-    return tuple(frames_topic(name) for camera in cameras for name in frame_topics(f"{camera}.image"))
 
 
 def frames_topic(name: str) -> Topic:

@@ -18,6 +18,7 @@ from thermostand.foundation.readings import Frame, Quality
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import RecordedDevice, batch_form
 from thermostand.recording.format.layout import TELEMETRY
+from thermostand.recording.writing.forms import stages_of
 from thermostand.recording.writing.homes import FolderContents, Homes
 from thermostand.recording.writing.notices import DroppedReadings
 from thermostand.recording.writing.recorder_settings import RecordingSettings
@@ -124,7 +125,8 @@ class TelemetryEncoder:
 
     def __init__(self, devices: Mapping[str, RecordedDevice]) -> None:
         self._forms = {name: batch_form(name, device) for name, device in devices.items()}
-        self._table: dict[str, float] = {}  # unit -> last position of the axis in that unit
+        self._stages = stages_of(devices)
+        self._table: dict[str, float] = {}  # unit -> last position of the stage in that unit
 
     def check(self, item: Item) -> None:
         """ValueError when the item is a batch of a device that was not declared."""
@@ -137,7 +139,7 @@ class TelemetryEncoder:
             case Batch():
                 form = self._forms[item.device]
                 yield MessageRecord(form.topic, item.time_ns, form.encode(item))
-                if form.device.kind == "axis":
+                if item.device in self._stages:
                     yield from self._pose(item)
             case Frame():
                 pass
@@ -150,9 +152,9 @@ class TelemetryEncoder:
                 yield MessageRecord(messages.LOG, item.time_ns, messages.encode_log(item))
 
     def _pose(self, batch: Batch) -> Iterator[MessageRecord]:
-        """The table's pose for viewers, once both axes have reported their positions; none while one has none."""
+        """The table's pose for viewers, once both stages have reported their positions; none while one has none."""
         for reading in batch.readings:
-            if reading.channel == f"{batch.device}.position":
+            if reading.channel == self._stages[batch.device]:
                 self._table.pop(reading.unit, None)
                 if reading.quality is not Quality.BAD:
                     self._table[reading.unit] = reading.value

@@ -175,7 +175,7 @@ def _show(server: Server, state: StandState) -> None:
     data = {**run, "session": run.get("session") or server.name, "stand": state.model_dump(mode="json")}
     lines = idle_lines(server.name, state) if state.run is None else status_lines(str(data["session"]), state.run)
     unsafe = (_row("not safe yet", text) for text in not_yet_safe(state))
-    lines = [*unsafe, *lines, *(_row("next", text) for text in _next(state))]
+    lines = [*unsafe, *lines, *_further_lines(state), *(_row("next", text) for text in _next(state))]
     asked = [] if state.prompt is None else [_row("asks", f"{state.prompt.text}; `stand continue` when it is done")]
     show(data, [*lines, *asked])
 
@@ -220,6 +220,14 @@ def idle_lines(name: str, state: StandState) -> Iterator[str]:
     yield _row("queue", f"{waiting} to be run" + (f"; halted: {state.queue_halted}" if state.queue_halted else ""))
     if state.disk_free_bytes:  # 0 when nobody records, and it is not known
         yield _row("disk", f"{size(state.disk_free_bytes)} free")
+
+
+def _further_lines(state: StandState) -> Iterator[str]:
+    """What is read besides temperatures, flags and counts, each in its unit."""
+    for channel, reading in state.readings.items():
+        if reading.unit not in ("degC", "1"):
+            known = f"no reading: {reading.reason}" if reading.value is None else f"{reading.value:.6g} {reading.unit}"
+            yield _row("readings", f"{channel} {known.strip()}")
 
 
 def status_lines(session: Path | str, found: RunStatus) -> Iterator[str]:

@@ -9,7 +9,7 @@ those of the session, not today's files; the stand is this one (stand.running.op
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import merge
 from operator import attrgetter
@@ -23,10 +23,12 @@ from thermostand.foundation.progress import late_progress
 from thermostand.recording.format.journal_lines import text_hash
 from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.format.restarts import frames_lost_of, restarted_step
+from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.run_word import RunOutcome, last_run_event
 from thermostand.recording.reading.scan import scan
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
+from thermostand.stand.assembly import recorded_devices as declared_devices
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.executing.actions import cold_start
 from thermostand.stand.running.executing.camera_gap import CameraBefore, camera_before
@@ -138,6 +140,7 @@ def _interruption(
     all_entries = (*with_recorded(entries, items, _recorded_frames(session, plan)), *lost)
     info = SessionInfo.of(session.metadata)
     config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
+    differences = (*differences, *_changed_units(session, config))
     last_ns = max(entries[-1].time_ns, scan(directory).end_ns or 0)
     return Interruption(
         directory,
@@ -152,6 +155,17 @@ def _interruption(
         session.utc.at(last_ns),
         differences,
     )
+
+
+def _changed_units(session: Session, config: StandConfig) -> Iterator[Difference]:
+    """Channels that a device of this stand measures in another unit than it did in the session; what follows is kept
+    apart from what there is (`name_apart`)."""
+    before = recorded_devices(session.telemetry_segments)
+    for name, device in declared_devices(config).items():
+        units = {each.name: each.unit for each in before[name].channels} if name in before else {}
+        for each in device.channels:
+            if units.get(each.name, each.unit) != each.unit:
+                yield Difference(f"the unit of {name}.{each.name}", units[each.name], each.unit)
 
 
 def folded(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:

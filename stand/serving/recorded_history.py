@@ -4,23 +4,17 @@ restart. It reads disks: in a process of its own, never beside the guard.
 
 from __future__ import annotations
 
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from thermostand.foundation.clock import seconds_ns
 from thermostand.foundation.errors import StandError
-from thermostand.foundation.items import Batch
-from thermostand.recording.format.batches import READINGS
-from thermostand.recording.format.decoded_items import item_of
 from thermostand.recording.format.layout import FINISHED, TELEMETRY
-from thermostand.recording.format.records import telemetry_messages
 from thermostand.recording.reading.session import Session
 from thermostand.stand.serving.live_history import COARSE_CELLS, COARSE_S, Columns, History
 
 WEEK_NS = seconds_ns(COARSE_S * COARSE_CELLS)
-_LOOKED_AT = 500  # batches for the units; every device is polled many times among so many
 
 
 def recorded_week(directory: Path, now_ns: int) -> tuple[History, list[str]]:
@@ -45,7 +39,7 @@ def session_columns(path: Path | str, points: int) -> Columns:
 def fill_from(history: History, session: Session, from_ns: int = 0) -> tuple[int, int]:
     """Add what a session has from `from_ns` on; the first and last instant of it, (0, 0) when it has nothing."""
     ends: list[int] = []
-    for channel, unit in _units_of(session).items():
+    for channel, unit in session.units().items():
         times_ns, values = session.readings(channel)
         first = int(np.searchsorted(times_ns, from_ns))
         history.fill(channel, times_ns[first:], values[first:], unit)
@@ -55,17 +49,6 @@ def fill_from(history: History, session: Session, from_ns: int = 0) -> tuple[int
             history.mark(mark)
             ends.append(mark.time_ns)
     return min(ends, default=0), max(ends, default=0)
-
-
-def _units_of(session: Session) -> dict[str, str]:
-    """Channel -> unit, from the first readings: a column has none."""
-    units: dict[str, str] = {}
-    for segment in session.telemetry_segments[:1]:
-        found = telemetry_messages(segment, lambda channel: channel.topic.startswith(READINGS))
-        for item in map(item_of, islice(found, _LOOKED_AT)):
-            if isinstance(item, Batch):
-                units |= {reading.channel: reading.unit for reading in item.readings}
-    return {channel: units.get(channel, "") for channel in session.channels()}
 
 
 def _written_since(directory: Path, from_ns: int) -> list[Path]:

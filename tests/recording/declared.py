@@ -15,6 +15,7 @@ _CHANNELS: Mapping[str, tuple[tuple[str, str], ...]] = {
     "flap": (("position", "1"), ("current", "mA")),
     "imager": (("lens", "degC"), ("housing", "degC"), ("back", "degC"), ("clock_offset", "s")),
 }
+_KINDS = {"position": "position"}
 KINDS = tuple(_CHANNELS)
 
 
@@ -30,4 +31,5 @@ def form(name: str, kind: str = "") -> BatchForm:
 
 def _device(name: str, kind: str) -> RecordedDevice:
     units = {"mm": "deg"} if name == "rotary" else {}
-    return RecordedDevice(kind, tuple(Channel(each, units.get(unit, unit)) for each, unit in _CHANNELS[kind]))
+    channels = (Channel(each, units.get(unit, unit), _KINDS.get(each, "")) for each, unit in _CHANNELS[kind])
+    return RecordedDevice(kind, tuple(channels), is_opened=kind != "camera")

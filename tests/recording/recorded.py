@@ -10,7 +10,8 @@ from tests.recording.declared import declared
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
-from thermostand.foundation.readings import Frame, Quality, Reading, bad_reading
+from thermostand.foundation.readings import Channel, Frame, Quality, Reading, bad_reading
+from thermostand.recording.format.batches import RecordedDevice
 from thermostand.recording.format.images import FrameEncoding
 from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
@@ -22,6 +23,14 @@ INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\r\n"}
 DEVICES = declared({"thermometers": "thermometers", "regulator": "regulator", "camera": "camera"})
 DEVICES |= declared({"rotary": "axis", "linear": "axis"})
+_PUBLISHED = {
+    "thermometers": (Channel("air", "degC"), Channel("artifact", "degC")),
+    "regulator": (Channel("pv", "degC"),),
+    "linear": (Channel("position", "mm", "position"),),
+    "rotary": (Channel("position", "deg", "position"),),
+}
+PUBLISHED = {name: RecordedDevice(DEVICES[name].kind, channels) for name, channels in _PUBLISHED.items()}
+"""What `half_second` has readings of, and nothing else."""
 
 
 def frame(time_ns, index, dtype=np.uint8):
@@ -65,11 +74,12 @@ async def record(
     segment_s=2.0,
     period_ns=NS_PER_S // 2,
     attachments=ATTACHMENTS,
+    devices=DEVICES,
 ):
     """Publish `items(time_ns, index)` each period; returns all that were published."""
     clock, hub, published = VirtualClock(START_NS), Hub(), []
     settings = RecordingSettings(encoding, telemetry_commit_s=1.0, segment_s=segment_s)
-    recorder = Recorder(directory, INFO, attachments, DEVICES, hub, clock, settings=settings)
+    recorder = Recorder(directory, INFO, attachments, devices, hub, clock, settings=settings)
     hub.subscribe(published.append)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]

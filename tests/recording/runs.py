@@ -6,7 +6,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.recording.format.journal_lines import JOURNAL_NAME, journal_lines, mark_of
 
-from .recorded import START_NS, half_second, record
+from .recorded import PUBLISHED, START_NS, half_second, record
 
 SECONDS = 20  # five segments of each series, four frames in each
 BEGUN = {"run": "night-1", "plan": "0f", "texts": {}, "seed": 7}
@@ -65,9 +65,9 @@ def write_journal(directory, *found):
     return directory / JOURNAL_NAME
 
 
-async def record_run(directory, items=second, status="complete", seconds=SECONDS):
+async def record_run(directory, items=second, status="complete", seconds=SECONDS, devices=PUBLISHED):
     """The session in `directory`."""
-    await record(directory, seconds, items=items, segment_s=4.0, period_ns=NS_PER_S)
+    await record(directory, seconds, items=items, segment_s=4.0, period_ns=NS_PER_S, devices=devices)
     write_journal(directory, *entries(seconds, status))
     return directory
 

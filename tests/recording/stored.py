@@ -1,13 +1,12 @@
 """Frames as they are recorded, and the topics of the leading camera."""
 
-from tests.recording.declared import declared
 from thermostand.foundation.readings import Frame
-from thermostand.recording.format.images import Circumstances
-from thermostand.recording.writing.forms import frames_topics
+from thermostand.recording.format.images import Circumstances, frame_topics
+from thermostand.recording.writing.forms import frames_topic
 from thermostand.recording.writing.frames import PublishedFrame, frame_records
 from thermostand.recording.writing.segment import MessageRecord
 
-CAMERA_TOPICS = frames_topics(declared({"camera": "camera"}))
+CAMERA_TOPICS = tuple(map(frames_topic, frame_topics("camera.image")))
 
 
 def stored(frame: Frame, published_ns: int | None = None) -> list[MessageRecord]:

@@ -86,11 +86,11 @@ async def test_the_overview_has_frames_temperatures_and_events(session):
     assert (frames.count, frames.dropped) == (5, 3)
     assert frames.pixels == "16 x 12 px, 16 bit"
     assert (frames.first_ns, frames.last_ns) == (START_NS + 3 * NS_PER_S, START_NS + 7 * NS_PER_S)
-    camera, air = found.temperatures
-    assert (air.channel, air.count, air.bad, air.min_degC, air.max_degC) == ("thermometers.air", 10, 1, 20.0, 29.0)
-    assert air.mean_degC == pytest.approx((sum(range(20, 30)) - 22) / 9)
+    camera, _, air = found.channels
+    assert (air.channel, air.unit, air.count, air.bad, air.min, air.max) == ("thermometers.air", "degC", 10, 1, 20, 29)
+    assert air.mean == pytest.approx((sum(range(20, 30)) - 22) / 9)
     assert (camera.channel, camera.count, camera.bad) == ("camera.temperature", 10, 10)
-    assert math.isnan(camera.mean_degC)
+    assert math.isnan(camera.mean)
     assert found.gaps == found.scanned.findings == ()
     assert [event.kind for event in found.events] == ["device_lost", "run.end"]
     assert found.ending is not None
@@ -103,7 +103,7 @@ async def test_a_damaged_segment_is_reported_and_the_others_are_read(session):
     assert scan(session).state_text.startswith("damaged: telemetry/0001.mcap: ")
     found = overview(session)
     assert {each.where for each in found.scanned.findings} == {"telemetry/0001.mcap"}
-    assert 5 <= found.temperatures[1].count < 10
+    assert 5 <= found.channels[2].count < 10
     assert found.frames.count == 5
 
 

@@ -9,18 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from tests.recording.recorded import INFO
+from tests.recording.recorded import INFO, PUBLISHED
 from tests.recording.runs import SECONDS, entries, record_run, remove, second, write_journal
 from tests.stand.hostile_sessions import event, everywhere, rewritten
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark
-from thermostand.foundation.readings import Frame
+from thermostand.foundation.readings import Channel, Frame
+from thermostand.recording.format.batches import RecordedDevice
 from thermostand.recording.format.journal_lines import JOURNAL_NAME, text_hash
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.manifest import MANIFEST_NAME, Sealed, SessionInfo, journal_so_far, read_manifest
 from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.run_word import Files
-from thermostand.recording.reading.scan import scan, verify
+from thermostand.recording.reading.scan import Depth, scan, verify
 from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
 
@@ -309,10 +310,29 @@ def test_a_segment_that_its_recorder_did_not_come_to_list_is_a_note_until_it_is_
     assert named(verify(night)) == []
 
 
-async def test_a_device_that_was_declared_and_never_read_is_a_note(tmp_path):
-    found = verify(await record_run(tmp_path / "s", items=without_regulator))
-    assert found.files is Files.SOUND
+@pytest.mark.parametrize("depth", Depth)
+async def test_a_complete_run_without_a_device_that_was_declared_is_not_sound(tmp_path, depth):
+    found = scan(await record_run(tmp_path / "s", items=without_regulator), depth)
+    assert found.files is Files.INCOMPLETE
     assert "regulator" in [finding.text.partition(":")[0] for finding in found.findings]
+
+
+async def test_a_complete_run_without_a_channel_that_was_declared_is_not_sound(tmp_path):
+    more = RecordedDevice("regulator", (*PUBLISHED["regulator"].channels, Channel("mv_heat", "%")))
+    found = verify(await record_run(tmp_path / "s", devices={**PUBLISHED, "regulator": more}))
+    assert found.files is Files.INCOMPLETE
+    assert "regulator.mv_heat" in [finding.text.partition(":")[0] for finding in found.findings]
+
+
+@pytest.mark.parametrize(("is_used", "files"), [(True, Files.INCOMPLETE), (False, Files.SOUND)])
+async def test_a_camera_that_was_not_switched_on_may_have_no_reading_and_one_with_frames_may_not(
+    tmp_path, is_used, files
+):
+    name = "camera" if is_used else "spare"
+    unread = RecordedDevice("camera", (Channel("temperature", "degC"),), is_opened=False)
+    found = verify(await record_run(tmp_path / "s", devices={**PUBLISHED, name: unread}))
+    assert found.files is files
+    assert name in [finding.text.partition(":")[0] for finding in found.findings]
 
 
 def without_regulator(time_ns, index):

@@ -23,11 +23,12 @@ from thermostand.recording.exporting.export import export
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import RecordedDevice
+from thermostand.recording.format.images import frame_topics
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.records import frame_places, telemetry_messages
 from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import frames_topics, telemetry_topics
+from thermostand.recording.writing.forms import frames_topic, telemetry_topics
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.recording.writing.segment import MessageRecord, SeriesForm
 from thermostand.recording.writing.series import Series
@@ -154,8 +155,8 @@ def test_a_frame_comes_behind_what_was_published_at_its_instant_and_before_the_e
 def test_frames_of_one_instant_are_distinguished_by_their_camera_and_number(tmp_path):
     write_items(tmp_path, [batch(1)])
     frames = [small_frame(1, 7), replace(small_frame(1, 7), channel="side.image"), small_frame(1, 8)]
-    topics = frames_topics(declared({"camera": "camera", "side": "camera"}))
-    write(tmp_path / FRAMES, topics, list(map(stored, frames)), CompressionType.ZSTD)
+    side = tuple(map(frames_topic, frame_topics("side.image")))
+    write(tmp_path / FRAMES, (*CAMERA_TOPICS, *side), list(map(stored, frames)), CompressionType.ZSTD)
     session = Session.open(tmp_path)
     assert [(frame.channel, frame.block_id) for frame in session.frames()] == [
         ("camera.image", 7),

@@ -71,6 +71,17 @@ async def test_the_page_shows_the_stand_and_its_curves_move(night):
         assert not await trend.inner_text()  # of what is not read nobody knows where it goes
 
 
+async def test_what_a_device_measures_in_a_unit_of_its_own_has_a_row_and_a_curve(night):
+    async with a_page(night.chromium, night.port) as page:
+        now_ns = night.clock.now_ns()
+        pressure = Reading("lab.pressure", 1013.2, "hPa", now_ns)
+        night.hub.publish(Batch("lab", now_ns, (pressure, Reading("lab.wet", 1.0, "1", now_ns))))
+        row = page.locator(".readings tr", has_text="lab pressure")
+        await row.locator(".value", has_text="1013.20 hPa").wait_for()
+        await page.locator(".curve[aria-label*='hPa'] canvas").wait_for()
+        assert not await page.locator(".readings tr", has_text="lab wet").count()  # a flag has no curve
+
+
 async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_answer(night):
     night.is_idle = True
     async with a_page(night.chromium, night.port, size=PHONE) as page:

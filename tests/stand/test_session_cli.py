@@ -153,7 +153,7 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
         "frames 12, 40 x 30 px, 8 bit, ",
         "6 lost by the camera or its wire",
         "step 3 1 of 1 frames from 2026-01-01 18:00:01",
-        "thermometers.air 20.00 20.81 21.57 12 1",
+        "thermometers.air degC 20 20.805 21.571 12 1",
         "gaps none",
         "events 12 warning",
         "2026-01-01 18:00:02 warning: half second 4, 5 µm",
@@ -180,8 +180,8 @@ def test_info_as_json_has_everything_and_no_nan(session: Path):
     assert len(found["steps"]) == len(found["events"]) == COUNT
     assert found["steps"][4]["parameters"] == {"frames": 1, "interval_s": 0.5}
     assert (found["images"]["count"], found["images"]["dropped"]) == (COUNT, 6)
-    (air,) = [row for row in found["temperatures"] if row["channel"] == "thermometers.air"]
-    assert (air["count"], air["bad"], air["min_degC"]) == (COUNT, 1, 20.0)
+    (air,) = [row for row in found["channels"] if row["channel"] == "thermometers.air"]
+    assert (air["unit"], air["count"], air["bad"], air["min"]) == ("degC", COUNT, 1, 20.0)
 
 
 def test_info_says_what_is_unfinished_and_what_to_do(session: Path):

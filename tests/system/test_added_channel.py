@@ -1,9 +1,12 @@
 """A channel that another package's device declares is found everywhere by its own name and unit."""
 
+import asyncio
+import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,20 +15,28 @@ import yaml
 from tests.addresses import free_port
 from tests.installed import install, see_it_everywhere
 from tests.recording.test_export import csv_rows
+from tests.system.test_run import at_step
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError, NotCleared, StandTripped
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.items import Event
-from thermostand.foundation.readings import Channel
+from thermostand.foundation.items import Batch, Event
+from thermostand.foundation.readings import Channel, Reading
 from thermostand.recording.exporting.export import export
+from thermostand.recording.reading.overview import overview
 from thermostand.recording.reading.recorded_devices import recorded_devices
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.assembly import recorded_devices as declared_devices
+from thermostand.stand.commands.sessions.session_text import info_json, info_lines
 from thermostand.stand.config.stand_config import StandConfig, packaged
 from thermostand.stand.running.order import Order
-from thermostand.stand.service.run import run_virtual
+from thermostand.stand.running.resume import interruption
+from thermostand.stand.service.run import Interrupted, resume, run_virtual
+from thermostand.stand.serving.api.bridge import StateSnapshot
+from thermostand.stand.serving.api.reads import metrics
+from thermostand.stand.serving.desk import seen_state
 from thermostand.stand.serving.recorded_history import session_columns
 
 MODULE = '''
@@ -188,6 +199,52 @@ async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_pa
     history = session_columns(session.path, 200)
     assert {channel: history.units[channel] for channel in UNITS} == UNITS
     assert {round(value, 1) for value in history.low["lab.pressure"].tolist() if value == value} == {1013.2}
+    seen = overview(session.path)
+    ranges = {row["channel"]: row for row in cast("list[dict[str, Any]]", info_json(seen)["channels"])}
+    assert {name: ranges[name]["unit"] for name in UNITS} == UNITS
+    assert (ranges["lab.pressure"]["min"], ranges["lab.pressure"]["max"], ranges["lab.rain"]["max"]) == (
+        1013.2,
+        1013.2,
+        None,
+    )
+    assert any("lab.flow l/min" in line for line in info_lines(seen))
+    checked = verify(session.path)
+    assert checked.is_sound
+    assert [each.text for each in checked.findings if "though it was declared" in each.text] == []
+
+
+@pytest.mark.usefixtures("station")
+async def test_it_is_among_the_metrics_with_its_unit():
+    hub, clock, config = Hub(), VirtualClock(0), stand_with()
+    stand = assemble(config, hub, clock).stand
+    declared = declared_devices(config)["lab"].channels
+    readings = (Reading(f"lab.{each.name}", VALUES.get(each.name, 0.5), each.unit, 0) for each in declared)
+    hub.publish(Batch("lab", 0, tuple(readings)))
+    text = metrics(StateSnapshot(seen_state(config, stand, hub, clock), 0.0), 0, 0)
+    for channel, unit in UNITS.items():
+        assert f'thermostand_reading{{channel="{channel}",unit="{unit}"}} ' in text
+    await stand.safety.close()
+
+
+def test_a_unit_that_has_changed_when_a_run_is_resumed_is_an_event_and_its_readings_are_kept_apart(
+    tmp_path: Path, order: Callable[..., Order], station: Callable[[str, str], None]
+):
+    ordered = order(RECIPE, devices={"lab": lab()})
+    stop = at_step("soak", lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(Interrupted):
+        asyncio.run(run_virtual(ordered, tmp_path / "out", None, stop))
+    (directory,) = (tmp_path / "out").iterdir()
+    station('"hPa"', '"mbar"')
+    asyncio.run(resume(interruption(directory), lambda hub: None))
+    session = Session.open(directory)
+    (differs,) = [each.data for each in session.events() if each.kind == "stand_differs"]
+    assert (differs["path"], differs["session"], differs["stand"]) == ("the unit of lab.pressure", "hPa", "mbar")
+    pressures = {channel: unit for channel, unit in session.units().items() if channel.startswith("lab.pressure")}
+    assert pressures == {"lab.pressure": "hPa", "lab.pressure (mbar)": "mbar"}
+    ranges = {each.channel: each.count for each in overview(directory).channels}
+    for channel in pressures:
+        assert 0 < len(session.readings(channel)[0]) == ranges[channel]
+    assert verify(directory).is_sound
 
 
 OUTSIDE = "guard.channel_limit"

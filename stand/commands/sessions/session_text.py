@@ -14,7 +14,7 @@ from thermostand.foundation.usage import one_line
 from thermostand.recording.format.inventory import SegmentState
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.catalogue import ListedSession, entry_of
-from thermostand.recording.reading.overview import FramesSummary, Overview, RunStep, TemperatureRange
+from thermostand.recording.reading.overview import ChannelRange, FramesSummary, Overview, RunStep
 from thermostand.recording.reading.run_word import Files
 from thermostand.recording.reading.scan import Scan
 from thermostand.stand.commands.sessions.session_table import entry_json, size
@@ -31,7 +31,7 @@ def info_lines(found: Overview) -> Iterator[str]:
         _facts(found, utc),
         _steps(found, utc),
         _frames(found, utc),
-        _temperatures(found.temperatures),
+        _channels(found.channels),
         (*_gaps(found, utc), *_events(found.events, utc)),
     )
     for position, part in enumerate(parts):
@@ -170,18 +170,17 @@ def _capture(step: RunStep, utc: UtcOffsets) -> str:
     return f"{'':<{_LABEL}}step {step.index + 1:<4d} {step.frames} of {asked} frames from {begun}  {stated}"
 
 
-def _temperatures(temperatures: Sequence[TemperatureRange]) -> Iterator[str]:
-    if not temperatures:
-        yield from _row("temperatures", "none")
+def _channels(channels: Sequence[ChannelRange]) -> Iterator[str]:
+    if not channels:
+        yield from _row("readings", "none")
         return
-    width = max(len(temperature.channel) for temperature in temperatures)
-    yield f"{'temperatures':<{_LABEL}}{'degC':<{width}}{'min':>9}{'mean':>9}{'max':>9}{'readings':>10}{'BAD':>8}"
-    for row in temperatures:
-        numbers = "".join(
-            f"{value:9.2f}" if not math.isnan(value) else f"{'-':>9}"
-            for value in (row.min_degC, row.mean_degC, row.max_degC)
-        )
-        yield f"{'':<{_LABEL}}{one_line(row.channel):<{width}}{numbers}{row.count:>10}{row.bad:>8}"
+    names = [one_line(f"{row.channel} {row.unit}" if row.unit not in ("", "1") else row.channel) for row in channels]
+    width = max(map(len, names))
+    yield f"{'readings':<{_LABEL}}{'':<{width}}{'min':>9}{'mean':>9}{'max':>9}{'readings':>10}{'BAD':>8}"
+    for name, row in zip(names, channels, strict=True):
+        ends = (row.min, row.mean, row.max)
+        numbers = "".join(f"{'-':>9}" if math.isnan(value) else f"{value:>9.5g}" for value in ends)
+        yield f"{'':<{_LABEL}}{name:<{width}}{numbers}{row.count:>10}{row.bad:>8}"
 
 
 def _gaps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
@@ -198,8 +197,8 @@ def _events(events: Sequence[Event], utc: UtcOffsets) -> Iterator[str]:
 
 
 def info_json(found: Overview) -> dict[str, object]:
-    """`stand session info --json`: everything, lists in full; a temperature that was never good is null.
-    Instants are as in entry_json."""
+    """`stand session info --json`: everything, lists in full; null for min, mean and max of a channel that was never
+    good. Instants are as in entry_json."""
     utc = found.scanned.utc
     return {
         **entry_json(_entry(found)),
@@ -217,9 +216,9 @@ def info_json(found: Overview) -> dict[str, object]:
             "first": _instant(found.frames.first_ns, utc),
             "last": _instant(found.frames.last_ns, utc),
         },
-        "temperatures": [
-            {name: None if value != value else value for name, value in asdict(temperature).items()}
-            for temperature in found.temperatures
+        "channels": [
+            {name: None if value != value else value for name, value in asdict(channel).items()}
+            for channel in found.channels
         ],
         "gaps": [
             {**asdict(gap), "begin": _instant(gap.begin_ns, utc), "end": _instant(gap.end_ns, utc)}

@@ -40,6 +40,16 @@ export function temperatures(units) {
   return found.sort((one, other) => place(one) - place(other) || one.localeCompare(other, undefined, { numeric: true }));
 }
 
+// Unit -> channels, of what is measured besides: no temperature, no flag or count (unit 1), and not on the page elsewhere.
+export function further(units, axes) {
+  const found = {};
+  for (const channel of Object.keys(units).sort()) {
+    const unit = units[channel], is_elsewhere = KNOWN[channel] || channel.includes(".drift_") || axes.includes(channel.split(".")[0]);
+    if (unit !== "degC" && unit !== "1" && !is_elsewhere) (found[unit] ??= []).push(channel);
+  }
+  return found;
+}
+
 const HIDDEN = "thermostand.hidden";
 
 export function hidden() {

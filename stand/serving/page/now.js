@@ -1,7 +1,7 @@
 // The first view: what the stand does now, and how it came to it.
 import { get } from "./api.js";
 import { Curves } from "./curves.js";
-import { hidden, look_of, set_hidden, temperatures } from "./channels.js";
+import { further, hidden, look_of, set_hidden, temperatures } from "./channels.js";
 import { clock, day_clock, fill, h, number, say, seconds, unit_of } from "./dom.js";
 import { FramePanel } from "./frame.js";
 
@@ -26,7 +26,7 @@ export class Now {
   }
 
   build(place) {
-    const zoom = (from_s, to_s) => { this.fixed = [from_s, to_s]; this.soon(); };
+    const zoom = this.zoom = (from_s, to_s) => { this.fixed = [from_s, to_s]; this.soon(); };
     this.ranges = h("div", { class: "row", role: "group", "aria-label": "Time shown" },
       RANGES.map(([name, span_s]) => h("button", { type: "button", class: "small", "data-span": span_s, onclick: () => this.choose(span_s) }, name)),
       this.back = h("button", { type: "button", class: "small", hidden: true, onclick: () => this.choose(this.span_s) }, "Back to now"));
@@ -34,6 +34,7 @@ export class Now {
     const power = h("div", { class: "curve", role: "img", "aria-label": "Heater power over time, and when the compressor ran" });
     const drift = h("div", { class: "curve", role: "img", "aria-label": "Drift of the markers over time" });
     this.drift_box = h("div", { hidden: true }, h("p", { class: "curve-name" }, "Drift since the reference, px"), drift);
+    this.further_box = h("div", {});
     const narrow = innerWidth < 700;
     this.plots = {
       above: new Curves(above, { height: narrow ? 250 : 340, unit: "°C", labels: !narrow, axis: false, marks: true, on_zoom: zoom }),
@@ -56,7 +57,7 @@ export class Now {
       h("div", { class: "stack" },
         h("section", { class: "panel" },
           h("div", { class: "head" }, h("h2", {}, "Temperatures"), this.hint, this.ranges),
-          above, h("p", { class: "curve-name" }, "Heater power, and the compressor"), power, this.drift_box),
+          above, h("p", { class: "curve-name" }, "Heater power, and the compressor"), power, this.drift_box, this.further_box),
         h("section", { class: "panel" }, h("h2", {}, "What happened"), h("div", { class: "events", tabindex: "0", role: "region", "aria-label": "Events" }, this.events)))));
     this.frame = new FramePanel(this.frame_place, this.app, false);
     this.show_choice();
@@ -96,8 +97,7 @@ export class Now {
   async fetch() {
     const state = this.app.state, offset_s = state.utc_offset_ns / 1e9;
     const [from_s, to_s] = this.window_s();
-    const units = Object.fromEntries(Object.entries(state.readings).map(([name, reading]) => [name, reading.unit]));
-    const shown = [...temperatures(units), "regulator.mv_heat", "regulator.mv_cool", "regulator.running", "relays.compressor", ...this.app.cameras().flatMap((name) => [`${name}.drift_mean`, `${name}.drift_worst`])];
+    const shown = [...this.measured(), "regulator.mv_heat", "regulator.mv_cool", "regulator.running", "relays.compressor", ...this.app.cameras().flatMap((name) => [`${name}.drift_mean`, `${name}.drift_worst`])];
     const points = Math.max(200, Math.min(1600, Math.round(this.plots.above.place.clientWidth)));
     const at = (s) => Math.max(0, Math.round((s - offset_s) * 1e9));
     const path = `/history?from_ns=${at(from_s)}&to_ns=${at(to_s)}&points=${points}&channels=${encodeURIComponent(shown.join())}`;
@@ -121,6 +121,28 @@ export class Now {
     const drift = Object.keys(history.low).filter((name) => name.includes(".drift_"));
     this.drift_box.hidden = !drift.length;
     if (drift.length) this.plots.drift.show(history, drift, this.hidden, from_s, to_s, offset_s);
+    for (const [unit, channels] of Object.entries(this.further(history.units))) {
+      this.further_plot(unit).show(history, channels, this.hidden, from_s, to_s, offset_s);
+    }
+  }
+
+  // The curves of what is measured in a unit of its own.
+  further_plot(unit) {
+    const key = `in ${unit}`;
+    if (!this.plots[key]) {
+      const place = h("div", { class: "curve", role: "img", "aria-label": `What is measured in ${unit || "no unit"}, over time` });
+      this.further_box.append(h("p", { class: "curve-name" }, unit ? `Measured in ${unit}` : "Measured, without a unit"), place);
+      this.plots[key] = new Curves(place, { height: 130, unit, labels: innerWidth >= 700, marks: true, on_zoom: this.zoom });
+    }
+    return this.plots[key];
+  }
+
+  further(units) { return further(units, Object.keys(this.app.state.axes)); }
+
+  // All that has a curve and a row: temperatures first.
+  measured() {
+    const units = this.units();
+    return [...temperatures(units), ...Object.values(this.further(units)).flat()];
   }
 
   // K/h over the last five minutes, from the means of their first and last minute.
@@ -137,7 +159,7 @@ export class Now {
   units() { return Object.fromEntries(Object.entries(this.app.state.readings).map(([name, { unit }]) => [name, unit])); }
 
   update(state) {
-    const channels = temperatures(this.units());
+    const channels = this.measured();
     if (this.rows_of !== channels.join()) {
       this.rows_of = channels.join();
       this.rows = Object.fromEntries(channels.map((channel) => [channel, this.row(channel)]));
@@ -171,8 +193,8 @@ export class Now {
     const unasked = channel === "regulator.sp" && state.setpoint_degC === null && reading.value !== null ? "none"
       : reading.value === null && !state.camera_on && this.app.cameras().includes(channel.split(".")[0]) ? "off" : "";
     if (unasked) row.dataset.quality = "good"; // nobody expects one now
-    say(value, unasked || (reading.value === null ? bad ?? "–" : `${number(reading.value, 2)} °C${bad ? ` (${bad})` : ""}`));
-    say(trend, channel === "regulator.sp" || unasked || reading.quality !== "good" ? "" : arrow(this.trends[channel]));
+    say(value, unasked || (reading.value === null ? bad ?? "–" : `${number(reading.value, 2)} ${unit_of(reading.unit)}${bad ? ` (${bad})` : ""}`));
+    say(trend, channel === "regulator.sp" || reading.unit !== "degC" || unasked || reading.quality !== "good" ? "" : arrow(this.trends[channel]));
   }
 
   update_flags(state) {
