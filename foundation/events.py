@@ -264,8 +264,8 @@ LATCH_NOT_KEPT = event("latch_not_kept", "error", "that the stand has tripped ma
     "see that the folder of the stand's state is there and has room")
 LATCH_NOT_CLEARED = event("latch_not_cleared", "warning", "at a restart the stand is taken for tripped: {said}",
     "`stand clear` again, when the disk answers")
-LIMITS_ACCEPTED = event("limits_accepted", "warning", "{said}",
-    "take `guard.accept` out of the stand's file when that is not wanted")
+LIMITS_OVERRIDDEN = event("limits_overridden", "warning", "{said}",
+    "take `guard.overrides` out of the stand's file when that is not wanted")
 NOT_CONFIRMED_SAFE = event("not_confirmed_safe", "error", "{said}",
     "switch the stand off by hand; `stand status` says when it is safe", alert=Alert("trip", "unsafe"), counts=True)
 CONFIRMED_SAFE = event("confirmed_safe", "info", "the stand is safe", alert=Alert("trip", "unsafe", "over"))

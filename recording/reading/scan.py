@@ -469,7 +469,7 @@ class _Look:
         for file in self._files:
             match file.state:
                 case SegmentState.UNFINISHED:
-                    yield _missing_part("is not finished; `stand session salvage` recovers what is in it", file.name)
+                    yield _missing_part("is not finished; `stand session repair` recovers what is in it", file.name)
                 case SegmentState.DAMAGED if _is_recovered(
                     file, by_name.get(f"{file.series}/{file.number:04d}{FINISHED}")
                 ):
@@ -559,7 +559,7 @@ class _Look:
         """What the recorder stated, against what is there."""
         stated = self._manifest
         if isinstance(stated, NoManifest):
-            remake = "; `stand session salvage` makes one of what is there"
+            remake = "; `stand session repair` makes one of what is there"
             if stated.is_missing and not self._is_recording:
                 yield _missing_part(
                     f"{stated.text}: whether all segments are there is not known{remake}", MANIFEST_NAME
@@ -591,7 +591,7 @@ class _Look:
             return None
         if each.salvage or (known is None and not stated.ended):
             why = "a salvage" if each.salvage else "its recorder"
-            return _note(f"{why} did not come to list it in {MANIFEST_NAME}; `stand session salvage` does", name)
+            return _note(f"{why} did not come to list it in {MANIFEST_NAME}; `stand session repair` does", name)
         if known is None:
             return _error(f"is none of the segments that {MANIFEST_NAME} lists", name)
         return _error(f"is not as it was recorded: {MANIFEST_NAME} lists another size or hash", name)

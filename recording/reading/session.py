@@ -396,5 +396,5 @@ def _check_finished(path: Path, incomplete: Say | None) -> None:
         return
     sentence = f"{path}: {left[0]} {'is' if len(left) == 1 else f'and {len(left) - 1} more are'} not finished and"
     if incomplete is None:
-        raise SessionError(f"{sentence} would be left out; `stand session salvage {path}` first")
-    incomplete(f"{sentence} left out; `stand session salvage {path}` recovers what is in it")
+        raise SessionError(f"{sentence} would be left out; `stand session repair {path}` first")
+    incomplete(f"{sentence} left out; `stand session repair {path}` recovers what is in it")

@@ -224,7 +224,7 @@ class Recorder:
         except TimeoutError as error:
             raise SessionError(
                 f"{self.directory}: the disk has not answered in time; the session is unfinished, {frames.waiting} "
-                f"frames and {telemetry.messages_waiting} messages waited to be saved; `stand session salvage` "
+                f"frames and {telemetry.messages_waiting} messages waited to be saved; `stand session repair` "
                 "completes it when the disk answers"
             ) from error
 

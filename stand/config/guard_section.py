@@ -78,11 +78,12 @@ class ChannelLimits(Document):
 class GuardConfig(Document):
     """When the guard makes the stand safe. The upper bounds are what the chamber survives: no file may lift them.
 
-    keys_s: how long the unit and we may differ about running, permits and the set-point. flap_open_s: how long the flap
-    may be open outside captures, flap_capture_s in all. disk_low_s: how long the recorder may refuse frames.
-    camera_temperature_s: how long a powered camera with frames to come may have no temperature.
+    panel_change_grace_s: how long the unit and this program may differ about running, permits and the set-point, as
+    when somebody changes them at its panel. flap_open_s: how long the flap may be open outside captures, flap_capture_s in
+    all. disk_low_s: how long the recorder may refuse frames. camera_temperature_s: how long a powered camera with
+    frames to come may have no temperature.
     pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
-    hours. accept: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
+    hours. overrides: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
     channels: limits for what any device measures, by its channel, as `lab.pressure`.
     added: settings of rules that other packages add, by their names. safe_limit_s: how long, at the end of a run, it is
     tried to have every actuator confirm that it is safe.
@@ -110,14 +111,14 @@ class GuardConfig(Document):
     camera_crosscheck: CameraCrosscheckConfig = CameraCrosscheckConfig()
     steady_state_power: SteadyStatePowerConfig = SteadyStatePowerConfig()
     startup_response: StartupResponseConfig = StartupResponseConfig()
-    keys_s: float = Field(default=30.0, ge=1, le=600)
+    panel_change_grace_s: float = Field(default=30.0, ge=1, le=600)
     flap_open_s: float = Field(default=300.0, gt=0, le=36000)
     # 45 min. Round number; nothing was measured.
     flap_capture_s: float = Field(default=2700.0, gt=0, le=36000)
     # Round number; nothing was measured.
     disk_low_s: float = Field(default=900.0, ge=0, le=36000)
     camera_temperature_s: float = Field(default=60.0, gt=0, le=36000)
-    accept: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
     # Round number; nothing was measured.
     pause_limit_h: float = Field(default=12.0, gt=0, le=24)
     channels: dict[str, ChannelLimits] = Field(default_factory=dict[str, ChannelLimits])

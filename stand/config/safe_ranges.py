@@ -1,4 +1,4 @@
-"""Values of a configuration that would disarm a rule: a file may have them only if `guard.accept` names their paths.
+"""Values of a configuration that would disarm a rule: a file may have them only if `guard.overrides` names their paths.
 
 The ranges of the fields themselves are wider, and no file can exceed them.
 """
@@ -43,7 +43,9 @@ SAFE_RANGES = (
     SafeRange("guard.sensors.trip_K", " K", "a probe that has come loose would go unnoticed", high=10),
     SafeRange("guard.sensors.trip_after_s", " s", "a probe that has come loose would control for too long", high=600),
     SafeRange("guard.stale_after_s", " s", "it would be heated for so long without knowing the temperature", high=30),
-    SafeRange("guard.keys_s", " s", "a set-point changed by hand would be followed for so long", high=120),
+    SafeRange(
+        "guard.panel_change_grace_s", " s", "a set-point changed by hand would be followed for so long", high=120
+    ),
     SafeRange("guard.flap_open_s", " s", "an open flap lets the chamber's air at the optics and the room", high=3600),
     SafeRange("guard.flap_capture_s", " s", "a capture that hangs would leave the flap open for so long", high=7200),
     SafeRange("guard.disk_low_s", " s", "it would be heated for so long without recording frames", high=1800),
@@ -55,8 +57,8 @@ SAFE_RANGES = (
 )
 # On drawn chambers without such a thermometer both probes that are 0.3 K low, or drift alike, are not found: the air
 # went to 85 degC. With a safety thermometer every failure stays below the limit.
-_WITNESSES = SafeRange(
-    "witnesses",
+_AIR_SENSOR = SafeRange(
+    "independent_air_sensor",
     "",
     "no thermometer would show that the regulator's probe and the air's are wrong alike; give another one "
     "`role: granite_inside`, or `role: safety` in the chamber's air",
@@ -78,12 +80,12 @@ def check(config: object, thermometers: Mapping[str, ThermometerSettings], accep
     known = {safe.path: (safe, value) for safe, value in found}
     for path in dict.fromkeys(accepted):
         if path not in known:
-            faults.append(f"guard.accept: {path} is not a path that can be accepted; those are {', '.join(known)}")
+            faults.append(f"guard.overrides: {path} is not a path that can be overridden; those are {', '.join(known)}")
         elif known[path][1] in known[path][0]:
             safe, value = known[path]
-            faults.append(f"guard.accept: {path} is not needed: {value:g}{safe.unit} is within its range ({safe})")
+            faults.append(f"guard.overrides: {path} is not needed: {value:g}{safe.unit} is within its range ({safe})")
         if accepted.count(path) > 1:
-            faults.append(f"guard.accept: {path} is given twice")
+            faults.append(f"guard.overrides: {path} is given twice")
     if faults:
         raise ValueError("; ".join(faults))
 
@@ -91,7 +93,7 @@ def check(config: object, thermometers: Mapping[str, ThermometerSettings], accep
 def _values(config: object, thermometers: Mapping[str, ThermometerSettings]) -> Iterator[tuple[SafeRange, float]]:
     for safe in SAFE_RANGES:
         yield safe, float(attrgetter(safe.path)(config))
-    yield _WITNESSES, float(len(attrgetter(_WITNESSES.path)(config)))
+    yield _AIR_SENSOR, float(len(attrgetter("independent_air_sensors")(config)))
     for name, entry in thermometers.items():
         path = f"thermometers.{name}.polynomial"
         yield SafeRange(path, " K", _CORRECTION, high=10), largest_correction_K(entry.offset_K, entry.polynomial)
@@ -104,7 +106,7 @@ def _refusal(safe: SafeRange, value: float) -> str:
         what = f"with offset_K a correction of up to {what} over {low_degC:g} to {high_degC:g} degC"
     return (
         f"{safe.path}: {what} is outside the safe range ({safe}): {safe.reason}; choose a value within it, or name "
-        f"{safe.path} in guard.accept"
+        f"{safe.path} in guard.overrides"
     )
 
 
@@ -124,8 +126,8 @@ def largest_correction_K(offset_K: float, polynomial: Sequence[float]) -> float:
 
 
 def accepted_text(accepted: Mapping[str, float]) -> str:
-    """What a start says of values outside their ranges that were accepted, by their paths."""
-    ranges = {safe.path: str(safe) for safe in (*SAFE_RANGES, _WITNESSES)}
+    """The sentence, shown at each start, on values outside their safe ranges that `guard.overrides` allows."""
+    ranges = {safe.path: str(safe) for safe in (*SAFE_RANGES, _AIR_SENSOR)}
     usual = "a correction of at most 10 K"
     weakened = [f"{path} {value:g} (safe: {ranges.get(path, usual)})" for path, value in accepted.items()]
-    return f"guard.accept weakens the protection: {', '.join(weakened)}"
+    return f"guard.overrides weakens the protection: {', '.join(weakened)}"

@@ -183,7 +183,7 @@ class StandConfig(Document):
         faults = next(self._faults(), None)
         if faults is not None:
             raise ValueError(faults)
-        check(self, self.thermometers, self.guard.accept)
+        check(self, self.thermometers, self.guard.overrides)
         return self
 
     def _faults(self) -> Iterator[str]:
@@ -229,7 +229,7 @@ class StandConfig(Document):
             yield f"regulator.thermometer: there is no thermometer {regulator.thermometer}, by its role {known}"
         if regulator.sample_s < self.thermometer_module.poll_s:
             yield "regulator.sample_s is shorter than thermometer_module.poll_s: between two readings nothing is new"
-        if regulator.thermometer == "air" and not self.witnesses:
+        if regulator.thermometer == "air" and not self.independent_air_sensors:
             yield (
                 "regulator controls by the air's thermometer, and no other would show that this one is wrong; give "
                 "another one `role: granite_inside`, or `role: safety` in the chamber's air"
@@ -301,8 +301,8 @@ class StandConfig(Document):
         if max(cameras_s, default=0.0) * 2 > guard.camera_temperature_s:
             yield f"guard.camera_temperature_s must be at least twice the poll_s of each camera ({max(cameras_s)} s)"
         slowest_s = max(self.controller.poll_s, self.relays.poll_s if self.relays is not None else 0.0)
-        if slowest_s * 2 > guard.keys_s:
-            yield f"guard.keys_s must be at least twice the poll of regulator and relays ({slowest_s} s)"
+        if slowest_s * 2 > guard.panel_change_grace_s:
+            yield f"guard.panel_change_grace_s must be at least twice the poll of regulator and relays ({slowest_s} s)"
 
     @property
     def sensors(self) -> dict[str, ThermometerSettings]:
@@ -310,11 +310,11 @@ class StandConfig(Document):
         return by_channel(self.thermometers)
 
     @property
-    def witnesses(self) -> list[str]:
+    def independent_air_sensors(self) -> list[str]:
         """The thermometers that show when the regulator's probe and the air's are wrong alike."""
         regulator = self.regulator
         controlling = regulator.thermometer if isinstance(regulator, SoftwareRegulatorSettings) else ""
-        return _witnesses(self.thermometers, controlling)
+        return _independent_air_sensors(self.thermometers, controlling)
 
     @property
     def set_points_degC(self) -> tuple[float, float]:
@@ -349,7 +349,7 @@ class StandConfig(Document):
         return {each.kind.section: each.settings for each in self.equipment if isinstance(each.settings, OnBus)}
 
     def accepted(self) -> dict[str, float]:
-        """The values outside their safe ranges, which guard.accept names, by their paths."""
+        """The values outside their safe ranges, which guard.overrides names, by their paths."""
         return outside(self, self.thermometers)
 
     @property
@@ -375,7 +375,7 @@ class StandConfig(Document):
 GUARDED: tuple[Role, ...] = ("air",)  # without which nothing is heated
 
 
-def _witnesses(thermometers: Mapping[str, ThermometerSettings], controlling: str = "") -> list[str]:
+def _independent_air_sensors(thermometers: Mapping[str, ThermometerSettings], controlling: str = "") -> list[str]:
     """The thermometers by which the guard finds that the regulator's probe and the air's are wrong alike: the granite
     inside, which follows the air, and safety ones; not the one that `controlling` names."""
     sensors = by_channel(thermometers)

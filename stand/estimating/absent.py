@@ -26,9 +26,9 @@ def _absences(config: StandConfig) -> Iterator[Absence]:
         yield Absence(
             "thermometer in the granite inside", "its drift is not split from the camera's, and it guards nothing"
         )
-    if not config.witnesses:
+    if not config.independent_air_sensors:
         yield Absence(
-            "witness of the air", "a regulator's probe and an air thermometer that are wrong alike are not found"
+            "independent air sensor", "a regulator's probe and an air thermometer that are wrong alike are not found"
         )
     if "laboratory" not in config.sensors:
         yield Absence("thermometer in the laboratory", "a night ends at ending.ambient_degC")

@@ -159,9 +159,9 @@ def _heat(config: StandConfig, seen: Witnesses) -> tuple[Watch, ...]:
             )
         ),
         Watch(cooling_in_vain(limits.cooling, AIR, "regulator", COMPRESSOR, _surroundings(config)), action="hold"),
-        # The unit and this program may differ for keys_s: somebody may press a key at its panel.
-        Watch(permit_missing(RUNNING, PERMIT), 2 * limits.keys_s, "hold"),
-        Watch(trustworthy(PERMIT, limits.keys_s), limits.keys_s, "hold"),
+        # The unit and this program may differ for panel_change_grace_s: somebody may press a key at its panel.
+        Watch(permit_missing(RUNNING, PERMIT), 2 * limits.panel_change_grace_s, "hold"),
+        Watch(trustworthy(PERMIT, limits.panel_change_grace_s), limits.panel_change_grace_s, "hold"),
     )
 
 
@@ -282,8 +282,8 @@ def _operations(config: StandConfig, announced: Announcements) -> tuple[Watch, .
     """
     limits = config.guard
     return (
-        Watch(reported_fault("regulator.fault"), limits.keys_s, "hold"),
-        Watch(stopped_while_permitted(RUNNING, PERMIT), limits.keys_s, "hold"),
+        Watch(reported_fault("regulator.fault"), limits.panel_change_grace_s, "hold"),
+        Watch(stopped_while_permitted(RUNNING, PERMIT), limits.panel_change_grace_s, "hold"),
         *(Watch(stage_alarm(f"{name}.position"), action="hold") for name in config.axes),
         *(Watch(settings_changed(f"{name}.homed"), action="warn") for name in config.axes),
         *(_flap_watches(config, announced) if config.flap is not None else ()),

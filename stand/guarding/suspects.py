@@ -134,7 +134,7 @@ class Witnesses:
     def _asked(
         self, witness: str, pair: tuple[str, str], now: Mapping[str, float], begin: int | None, readings: Readings
     ) -> str:
-        """Against which of both the witness speaks, "" for none."""
+        """Which of both the other sensor contradicts, "" for none."""
         seen = _believed(readings, witness)
         if math.isnan(seen):
             return ""

@@ -29,7 +29,7 @@ from thermostand.foundation.clock import Clock, VirtualClock, WallClock, seconds
 from thermostand.foundation.errors import ConfigError, Interrupted, Refused, SessionError, StandError, StandTripped
 from thermostand.foundation.events import (
     JOURNAL_DAMAGED,
-    LIMITS_ACCEPTED,
+    LIMITS_OVERRIDDEN,
     NO_CAMERA_TEMPERATURE,
     NO_CONTROL,
     SALVAGED,
@@ -406,7 +406,7 @@ async def _announce(job: Job, assembly: Assembly, disk: DiskProcess | None = Non
             continue
         hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
     if accepted := job.order.config.accepted():
-        hub.publish(LIMITS_ACCEPTED.at(clock.now_ns(), accepted_text(accepted), **accepted))
+        hub.publish(LIMITS_OVERRIDDEN.at(clock.now_ns(), accepted_text(accepted), **accepted))
     if job.before is not None and job.before.journal.damage:
         hub.publish(JOURNAL_DAMAGED.at(clock.now_ns(), job.before.journal.damage))
     for difference in () if job.before is None else job.before.differences:

@@ -11,7 +11,7 @@ from thermostand.foundation.clock import Clock, WallClock
 from thermostand.foundation.errors import StandError, StandTripped
 from thermostand.foundation.events import (
     DAEMON_FILE_DAMAGED,
-    LIMITS_ACCEPTED,
+    LIMITS_OVERRIDDEN,
     NOT_REPORTED,
     REPORT,
     REPORTED,
@@ -132,7 +132,7 @@ async def serve(
             for segment in await orders.repair.call(salvage_unfinished, out):
                 hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
             if accepted := config.accepted():
-                hub.publish(LIMITS_ACCEPTED.at(clock.now_ns(), accepted_text(accepted), **accepted))
+                hub.publish(LIMITS_OVERRIDDEN.at(clock.now_ns(), accepted_text(accepted), **accepted))
             if damage:
                 hub.publish(DAEMON_FILE_DAMAGED.at(clock.now_ns(), damage))
             daemon = Daemon(

@@ -274,7 +274,7 @@ def test_what_a_killed_recorder_left_is_not_left_out_in_silence(unfinished: Path
     status, said = ask("detect", unfinished, "-o", out)
     assert status == 1
     assert said.startswith(f"error: {unfinished}: frames/0001.mcap.part is not finished")
-    assert f"`stand session salvage {unfinished}`" in said
+    assert f"`stand session repair {unfinished}`" in said
     assert not out.exists()
     status, said = ask("detect", unfinished, "-o", out, "--incomplete")
     assert status == 0

@@ -19,9 +19,9 @@ LABORATORY = yaml.safe_load((CONFIGS / "laboratory.yaml").read_text())
 QUICK_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
-def changed(tmp_path: Path, path: str, value: object, accept: list[str] | None = None) -> Path:
+def changed(tmp_path: Path, path: str, value: object, overrides: list[str] | None = None) -> Path:
     data = deepcopy(LABORATORY)
-    data["guard"]["accept"] = accept or []
+    data["guard"]["overrides"] = overrides or []
     section = data
     *parents, last = path.split(".")
     for parent in parents:
@@ -83,7 +83,11 @@ def test_installed_recipes_are_valid_and_named_as_their_file(path: Path):
         ("guard.max_camera_degC", float("inf"), "guard.max_camera_degC: must be a finite number"),
         ("guard.heater_off.rise_K", 0, "guard.heater_off.rise_K: must be greater than 0"),
         ("guard.sensors.warn_K", 7, "guard.sensors: warn_K 7.0 is above trip_K 6.0"),
-        ("guard.keys_s", 9, "guard.keys_s must be at least twice the poll of regulator and relays (5.0 s)"),
+        (
+            "guard.panel_change_grace_s",
+            9,
+            "guard.panel_change_grace_s must be at least twice the poll of regulator and relays (5.0 s)",
+        ),
         ("alerts.command", "mail", "alerts.command: give a list: each entry behind a dash"),
         ("alerts.command", ["mail", ""], "alerts.command.2: must have at least 1 character"),
         ("alerts.command_limit_s", 61, "alerts.command_limit_s: must be less than or equal to 60"),
@@ -137,7 +141,12 @@ SAFE_EDGES = [  # path, the last safe value, one that is not, what the refusal s
     ("guard.sensors.trip_K", 10, 10.5, "10.5 K is outside the safe range (at most 10 K): a probe that"),
     ("guard.sensors.trip_after_s", 600, 601, "601 s is outside the safe range (at most 600 s): a probe that"),
     ("guard.stale_after_s", 30, 31, "31 s is outside the safe range (at most 30 s): it would be heated"),
-    ("guard.keys_s", 120, 121, "121 s is outside the safe range (at most 120 s): a set-point changed by hand"),
+    (
+        "guard.panel_change_grace_s",
+        120,
+        121,
+        "121 s is outside the safe range (at most 120 s): a set-point changed by hand",
+    ),
     ("guard.flap_open_s", 3600, 3601, "3601 s is outside the safe range (at most 3600 s): an open flap"),
     ("guard.flap_capture_s", 7200, 7201, "7201 s is outside the safe range (at most 7200 s): a capture that hangs"),
     ("guard.disk_low_s", 1800, 1801, "1801 s is outside the safe range (at most 1800 s): it would be heated"),
@@ -161,44 +170,49 @@ def test_a_value_that_disarms_a_rule_is_refused_unless_its_path_is_accepted(
     with pytest.raises(ConfigError) as caught:
         load_config(file)
     assert str(caught.value).startswith(f"{file}: {path}: {sentence}")
-    assert str(caught.value).endswith(f" {path} in guard.accept")
-    accepted = load_config(changed(tmp_path, path, unsafe, accept=[path])).accepted()
+    assert str(caught.value).endswith(f" {path} in guard.overrides")
+    accepted = load_config(changed(tmp_path, path, unsafe, overrides=[path])).accepted()
     assert accepted == {path: pytest.approx(unsafe if isinstance(unsafe, int | float) else 11.0)}
 
 
 def test_every_value_outside_is_named_at_once_and_accepting_one_leaves_the_others_refused(tmp_path: Path):
     data = yaml.safe_load(changed(tmp_path, "compressor.min_off_s", 10, ["compressor.min_off_s"]).read_text())
-    data["guard"].update(keys_s=300, stale_after_s=60)
+    data["guard"].update(panel_change_grace_s=300, stale_after_s=60)
     (tmp_path / "changed.yaml").write_text(yaml.safe_dump(data))
     with pytest.raises(ConfigError) as caught:
         load_config(tmp_path / "changed.yaml")
-    assert "guard.keys_s: 300 s is outside" in str(caught.value)
+    assert "guard.panel_change_grace_s: 300 s is outside" in str(caught.value)
     assert "guard.stale_after_s: 60 s is outside" in str(caught.value)
     assert "min_off_s: " not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("accept", "sentence"),
+    ("overrides", "sentence"),
     [
-        (["bus.timeout_s"], "guard.accept: bus.timeout_s is not needed: 0.3 s is within its range (at most 2 s)"),
-        (["guard.max_air_degC"], "guard.accept: guard.max_air_degC is not a path that can be accepted; those are comp"),
-        (["compressor"], "guard.accept: compressor is not a path that can be accepted"),
-        (["thermometers.air.offset_K"], "air.offset_K is not a path that can be accepted"),
-        ([""], "guard.accept:  is not a path that can be accepted"),
-        (["compressor.min_on_s"] * 2, "guard.accept: compressor.min_on_s is given twice"),
+        (["bus.timeout_s"], "guard.overrides: bus.timeout_s is not needed: 0.3 s is within its range (at most 2 s)"),
+        (
+            ["guard.max_air_degC"],
+            "guard.overrides: guard.max_air_degC is not a path that can be overridden; those are comp",
+        ),
+        (["compressor"], "guard.overrides: compressor is not a path that can be overridden"),
+        (["thermometers.air.offset_K"], "air.offset_K is not a path that can be overridden"),
+        ([""], "guard.overrides:  is not a path that can be overridden"),
+        (["compressor.min_on_s"] * 2, "guard.overrides: compressor.min_on_s is given twice"),
     ],
 )
-def test_an_entry_of_accept_that_is_not_needed_or_no_path_is_refused(tmp_path: Path, accept: list[str], sentence: str):
-    value = 10 if "compressor.min_on_s" in accept else 180
+def test_an_entry_of_overrides_that_is_not_needed_or_no_path_is_refused(
+    tmp_path: Path, overrides: list[str], sentence: str
+):
+    value = 10 if "compressor.min_on_s" in overrides else 180
     with pytest.raises(ConfigError) as caught:
-        load_config(changed(tmp_path, "compressor.min_on_s", value, accept))
+        load_config(changed(tmp_path, "compressor.min_on_s", value, overrides))
     assert sentence in str(caught.value)
 
 
 @pytest.mark.parametrize(("path", "value"), [("guard.stale_after_s", 121), ("bus.timeout_s", 11)])
 def test_what_no_file_may_have_cannot_be_accepted(tmp_path: Path, path: str, value: float):
     with pytest.raises(ConfigError, match=f"{path}: must be less"):
-        load_config(changed(tmp_path, path, value, accept=[path]))
+        load_config(changed(tmp_path, path, value, overrides=[path]))
 
 
 @pytest.mark.parametrize(

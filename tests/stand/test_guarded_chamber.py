@@ -25,7 +25,7 @@ def with_thermometers(**thermometers: dict[str, object]) -> StandConfig:
     data = yaml.safe_load(packaged("", "simulated").read_text())
     data |= {"thermometers": thermometers, "cameras": {}}
     if "ceiling" not in thermometers:
-        data.setdefault("guard", {})["accept"] = ["witnesses"]
+        data.setdefault("guard", {})["overrides"] = ["independent_air_sensor"]
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
 

@@ -51,7 +51,7 @@ def test_the_list_has_a_line_for_each_session_and_for_a_damaged_one(session: Pat
     running, first, last = (line.split(maxsplit=8) for line in lines)  # the one without a known start is first
     assert (running[0], running[1]) == ("y-running", "thermal_cycle")
     assert (
-        "interrupted  incomplete: frames/0000.mcap.part: is not finished; `stand session salvage` recovers what"
+        "interrupted  incomplete: frames/0000.mcap.part: is not finished; `stand session repair` recovers what"
         in lines[0]
     )
     assert first[:6] == [session.name, "thermal_cycle", "2026-01-01", "18:00:00", "5.5", "s"]
@@ -190,7 +190,7 @@ def test_info_says_what_is_unfinished_and_what_to_do(session: Path):
     said = " ".join(ask("info", session).stdout.split())
     assert "files incomplete" in said
     assert "frames/0001.mcap.part is unfinished (" in said
-    assert f"stand session salvage {session}" in said
+    assert f"stand session repair {session}" in said
 
 
 def test_verify_tells_what_was_lost_before_the_recording_and_that_the_session_is_sound(session: Path):

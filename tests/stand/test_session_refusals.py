@@ -24,7 +24,7 @@ def test_what_was_not_finished_is_not_left_out_in_silence(session: Path, tmp_pat
     path.rename(path.with_name("0001.mcap.part"))
     (line,) = ask(command, session, option, tmp_path / "new", status=1).stderr.splitlines()
     assert line.startswith(f"error: {session}: frames/0001.mcap.part ")
-    assert f"`stand session salvage {session}`" in line
+    assert f"`stand session repair {session}`" in line
     assert not (tmp_path / "new").exists()
 
 
@@ -55,7 +55,7 @@ def test_a_command_that_meets_damage_says_that_a_salvage_helps(
     speed = ("--speed", "max") if command == "replay" else ()
     line = ask(command, session, option, tmp_path / "new", *speed, status=1).stderr.splitlines()[-1]
     assert line.startswith(f"error: {path}: ")
-    assert line.endswith(f"; `stand session salvage {session}` recovers what is sound")
+    assert line.endswith(f"; `stand session repair {session}` recovers what is sound")
     assert not (tmp_path / "new").exists()
 
 

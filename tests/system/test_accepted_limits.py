@@ -44,11 +44,11 @@ def test_a_weakened_limit_is_refused_and_when_accepted_by_name_shown_at_each_sta
     assert len(refused.stderr.splitlines()) == 1
     assert not (tmp_path / "sessions").exists()
 
-    run = stand("run", *out, compressor={"min_off_s": 60}, guard={"accept": ["compressor.min_off_s"]})
+    run = stand("run", *out, compressor={"min_off_s": 60}, guard={"overrides": ["compressor.min_off_s"]})
     assert run.exit_code == 0, run.stderr
     assert "compressor.min_off_s 60 (safe: at least 180 s)" in run.stderr
     events = Session.open(Path(run.stdout.strip())).events()
-    reported = [(event.level, event.data) for event in events if event.kind == "limits_accepted"]
+    reported = [(event.level, event.data) for event in events if event.kind == "limits_overridden"]
     assert reported == [("warning", {"compressor.min_off_s": 60.0})]
 
 

@@ -278,7 +278,7 @@ async def test_a_daemon_that_starts_again_spares_the_compressor_as_one_that_goes
 
 async def test_a_relay_board_that_stays_silent_holds_the_stand(order: Callable[..., Order], simulator: Start):
     """Its timed-on relays have dropped by themselves meanwhile."""
-    ordered = order(bus={"timeout_s": 0.05}, relays={"poll_s": 5.0}, guard={"keys_s": 10.0})
+    ordered = order(bus={"timeout_s": 0.05}, relays={"poll_s": 5.0}, guard={"panel_change_grace_s": 10.0})
     async with bench_of(ordered, simulator) as bench:
         await bench.start(26, 60)
         await bench.fault("relays.silent_s", 22)

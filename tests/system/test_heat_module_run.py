@@ -62,7 +62,7 @@ async def test_a_module_that_is_gone_for_longer_than_its_watchdog_holds_the_stan
         await stand.wait(15)
         assert await stand.true("heater_W") == 0
         await stand.break_("heat_module.silent", False)
-        await stand.wait(stand.assembly.config.guard.keys_s + 15)
+        await stand.wait(stand.assembly.config.guard.panel_change_grace_s + 15)
         assert stand.trips() == ["device_fault"]
         assert await stand.true("heater_enabled") == 0
 

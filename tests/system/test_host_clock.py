@@ -153,7 +153,7 @@ async def test_the_compressor_rests_whatever_the_system_clock_does_between_two_d
     """And `resume` goes on in a session that is an hour ahead of the system clock."""
     rest_s = 20.0
     compressor = {"min_off_s": rest_s, "min_on_s": 0, "state_file": str(tmp_path / "compressor.json")}
-    accept = {"accept": ["compressor.min_off_s", "compressor.min_on_s"]}
+    accept = {"overrides": ["compressor.min_off_s", "compressor.min_on_s"]}
     host = Host(tmp_path, order(COLD, compressor=compressor, guard=accept), monkeypatch)
     try:
         with host.daemon() as first:

@@ -104,7 +104,7 @@ def one_thermometer(data: Data) -> None:
         thermometers("air", "granite_inside")(data)
         return
     thermometers("air")(data)
-    data.setdefault("guard", {})["accept"] = ["witnesses"]
+    data.setdefault("guard", {})["overrides"] = ["independent_air_sensor"]
 
 
 def sixteen(data: Data) -> None:
@@ -129,7 +129,7 @@ def beside(data: Data) -> None:
 
 
 NO_LABORATORY = "no thermometer in the laboratory"
-NO_GRANITE = ("no thermometer in the granite inside", "no witness of the air")
+NO_GRANITE = ("no thermometer in the granite inside", "no independent air sensor")
 PLACES: Mapping[str, tuple[Choice, ...]] = {
     "heat": (
         Choice("omron-e5cc", nothing),
@@ -339,7 +339,7 @@ async def test_each_combination_is_reported(combination: Combination, tmp_path: 
 def test_one_thermometer_alone_has_to_be_accepted_by_name_and_is_not_controlled_by():
     data = copy.deepcopy(SIMULATED)
     thermometers("air")(data)
-    with pytest.raises(ConfigError, match="witnesses: 0 is outside"):
+    with pytest.raises(ConfigError, match="independent_air_sensor: 0 is outside"):
         configured(data)
     one_thermometer(data)
     configured(data)

@@ -304,7 +304,7 @@ def real_document(case: Case, folder: Path) -> dict[str, Any]:
     for camera in data["cameras"].values():
         camera |= {**CAMERA, "address": camera_address()}
     data["compressor"] = BRIEF
-    data["guard"].setdefault("accept", []).extend(f"compressor.{name}" for name in BRIEF)
+    data["guard"].setdefault("overrides", []).extend(f"compressor.{name}" for name in BRIEF)
     return data
 
 

@@ -75,7 +75,7 @@ def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
     not finished, and not `incomplete`; what is being recorded is left out with a warning. Damage that the command meets
     becomes a sentence that says what helps."""
     files = inventory(check_session(directory))
-    help_text = f"`stand session salvage {directory}`"
+    help_text = f"`stand session repair {directory}`"
     growing = [file.name for file in files if file.state is SegmentState.RECORDING]
     if growing:
         _warn(f"{directory}: is being recorded; left out because they are not finished yet: {', '.join(growing)}")
@@ -119,7 +119,7 @@ def salvage(
     """Finish unfinished segments and repair damaged ones; nothing valid is lost. Status 1 when something was not
     recovered: its original is then kept as .damaged.
 
-    Example: stand session salvage sessions
+    Example: stand session repair sessions
     """
     sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
     done: list[Salvaged] = []

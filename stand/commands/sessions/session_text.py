@@ -88,7 +88,7 @@ def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     for text in _limited(seen.sentences(Files.INCOMPLETE)):
         yield from _row("missing", text)
     if found.scanned.sentences(Files.DAMAGED) or seen.count(SegmentState.UNFINISHED):
-        yield from _row("to do", f"stand session salvage {seen.path}")
+        yield from _row("to do", f"stand session repair {seen.path}")
 
 
 def _said(entry: ListedSession) -> Iterator[str]:
