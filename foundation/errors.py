@@ -12,8 +12,8 @@
     │   ├── Occupied           operated at the unit by hand; it takes no orders until that ends
     │   └── Superseded         a newer command, or making safe, has overtaken this one: not a fault
     ├── Interrupted            the operator ended the run
-    ├── StandTripped           the guard has made the stand safe; an operator must clear it
-    │   └── NotCleared         ... and nobody has, in virtual time
+    ├── StandTripped           the guard has made the stand safe; an operator must reset it
+    │   └── NotReset           ... and nobody has, in virtual time
     ├── SessionError           a recorded session cannot be read
     │   └── NotThere           what was named is not there: bad input, for a program
     ├── DetectionError         no target in the image, or one that is not identified beyond doubt
@@ -88,11 +88,11 @@ class Interrupted(StandError):
 
 
 class StandTripped(StandError):
-    """The guard has latched: actuators are safe and nothing may move until an operator clears it."""
+    """The guard has latched: actuators are safe and nothing may move until an operator resets it."""
 
 
-class NotCleared(StandTripped):
-    """A run in virtual time was held until an operator clears the hold, and none came."""
+class NotReset(StandTripped):
+    """A run in virtual time was held until an operator resets the hold, and none came."""
 
 
 class SessionError(StandError):

@@ -199,7 +199,7 @@ def state_of(event: Event) -> tuple[str, str] | None:
 
 
 # What is to be done, of more than one kind.
-CLEAR = "`stand clear` once the cause is removed"
+RESET_ADVICE = "`stand reset` once the cause is removed"
 CONNECTED = "`stand devices` shows what is connected"
 SENSOR = "compare it with another thermometer at its place, and look at its cable"
 CAMERA_ENDS = f"it continues when the camera answers: {CONNECTED}"
@@ -209,7 +209,7 @@ _BY_ITSELF = "it continues by itself when that is over"
 _SEE_DISK = "see that the disk has room and answers"
 _NOT_ON = "look at the relay board, its supply and that channel: `stand check` tries each relay"
 _SWITCHED = "find what else switches it: a key of the unit, a second program on its line"
-_CLEAR_FOLDER = "have its disk mounted, or the folder moved back, then `stand clear`"
+_RESET_FOLDER = "have its disk mounted, or the folder moved back, then `stand reset`"
 _SHOW_SESSION = "`stand session info {folder}` shows what is missing"
 _CAREFUL = "`stand session note {folder} TEXT` informs those who fit it"
 _NOTHING = "nothing is to be done"
@@ -219,7 +219,7 @@ _SLEEP = "keep this computer awake: `systemctl mask sleep.target suspend.target`
 _PLAN = "`stand status --plan` shows the plan"
 _QUEUE = "`stand queue list` shows the queue"
 _ELSE = "`stand status` shows how it stands"  # of kinds of another version, or of an experiment's own
-_TRIPPED = "once the cause is removed, `stand clear` where a daemon has the stand, else `stand resume {folder} --clear`"
+_TRIPPED = "once the cause is removed, `stand reset` where a daemon has the stand, else `stand resume {folder} --reset`"
 
 
 # A table: a row has as many lines as it needs.
@@ -231,7 +231,7 @@ def _level_of_guard(data: Data) -> Level:
 
 def _after_guard(data: Data) -> str:
     if data.get("action") == "hold":
-        return _BY_ITSELF if data.get("ends_itself") else CLEAR
+        return _BY_ITSELF if data.get("ends_itself") else RESET_ADVICE
     return _TRIPPED if data.get("action") == "abort" else ""
 
 
@@ -253,7 +253,7 @@ def _hold_ended(said: str, rule: str, endings_in_last_h: int | None = None) -> s
 
 
 HOLD_ENDED = event("hold_ended", "warning", _hold_ended, _NOTHING, alert=Alert("hold", "guard", "over"), counts=True)
-HOLD_STAYS = event("hold_stays", "error", "{said}", CLEAR, alert=Alert("hold", "guard"), counts=True)
+HOLD_STAYS = event("hold_stays", "error", "{said}", RESET_ADVICE, alert=Alert("hold", "guard"), counts=True)
 GUARD_LATE = event("guard_late", "warning",
     "the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up",
     "see what stopped or loads this computer; " + _SLEEP)
@@ -262,8 +262,8 @@ SENSOR_BELIEVED = event("sensor_believed", "info",
     is_limited=True)
 LATCH_NOT_KEPT = event("latch_not_kept", "error", "that the stand has tripped may be forgotten at a restart: {said}",
     "see that the folder of the stand's state is there and has room")
-LATCH_NOT_CLEARED = event("latch_not_cleared", "warning", "at a restart the stand is taken for tripped: {said}",
-    "`stand clear` again, when the disk answers")
+LATCH_NOT_RESET = event("latch_not_reset", "warning", "at a restart the stand is taken for tripped: {said}",
+    "`stand reset` again, when the disk answers")
 LIMITS_OVERRIDDEN = event("limits_overridden", "warning", "{said}",
     "take `guard.overrides` out of the stand's file when that is not wanted")
 NOT_CONFIRMED_SAFE = event("not_confirmed_safe", "error", "{said}",
@@ -413,10 +413,10 @@ READINGS_DROPPED = event("readings_dropped", "error",
 READINGS_LOST = event("readings_lost", "error",
     "{readings} readings from {from_ns:utc} to {to_ns:utc} were dropped while the disk took nothing", _SHOW_SESSION,
     alert=Alert("disk", "readings", "over"), counts=True)
-FOLDER_LOST = event("folder_lost", "error", "{said}", _CLEAR_FOLDER, counts=True)
+FOLDER_LOST = event("folder_lost", "error", "{said}", _RESET_FOLDER, counts=True)
 FOLDER_BACK = event("folder_back", "info", "the session's folder {folder} is back")
 FOLDER_NOT_MADE = event("folder_not_made", "error", "{folder}: no folder can be made there again ({said})",
-    _CLEAR_FOLDER)
+    _RESET_FOLDER)
 
 
 def _recording_lost(said: str, what: list[str], from_ns: int, to_ns: int, reason: str, counts: object) -> str:
@@ -473,7 +473,7 @@ RUN_BEGINS = (RUN_START, RUN_RESUME)
 RUN_FAILED = event("run_failed", "error", "{said}", _QUEUE, alert=Alert("run_aborted"), counts=True)
 """Of one that may not have begun."""
 GAP = event("gap", "warning", "until now nothing was recorded and nobody watched the stand, for {said}", _SHOW_SESSION)
-CLEARED = event("cleared", "warning", "cleared before it was resumed: {said}", _NOTHING)
+RESET = event("reset", "warning", "the trip was reset before the run was resumed: {said}", _NOTHING)
 STAND_DIFFERS = event("stand_differs", "warning", "{said}",
     "`stand stop` if that is not meant, and `stand resume` with the right --config")
 JOURNAL_DAMAGED = event("journal_damaged", "warning", "{said}", "`stand status --plan` shows what counts as done")
@@ -521,10 +521,10 @@ COMMAND = event("command", "info", _command, counts=True, is_shown=True)
 NOTE = event("note", "info", "{said}")
 OPEN = event("open", "info", "{stand} is open; sessions go to {sessions}{said}")
 QUEUE = event("queue", "info", "{said}", is_shown=True)
-QUEUE_NOT_CLEARED = event("queue_not_cleared", "warning", "{said}", _QUEUE)
+QUEUE_STILL_HALTED = event("queue_still_halted", "warning", "{said}", _QUEUE)
 QUEUE_EMPTY = event("queue_empty", "info", "all that was queued is done", alert=Alert("queue_empty"))
 NOT_RESUMED = event("not_resumed", "error", "run {run} is not resumed by itself: {said}",
-    "`stand clear`, then `stand resume`")
+    "`stand reset`, then `stand resume`")
 RECORDING_RESTARTED = event("recording_restarted", "warning", "{session}: its writer was killed; the run is resumed",
     "see what killed it: `journalctl -k` tells of a lack of memory")
 HOUSE_NOT_RECORDED = event("house_not_recorded", "error",

@@ -1,6 +1,6 @@
 """How a command ends, each with one sentence (with --json also as a document): 0 as asked, 1 failed or damaged, 2 bad
 input, 3 a run that is complete and recorded but could not be reported, 4 a run in virtual time that was held and nobody
-cleared, 130 interrupted."""
+reset, 130 interrupted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import typer
 
-from thermostand.foundation.errors import ConfigError, Interrupted, NotCleared, NotThere, StandError
+from thermostand.foundation.errors import ConfigError, Interrupted, NotReset, NotThere, StandError
 from thermostand.foundation.output import output
 from thermostand.foundation.usage import ended, failed
 
@@ -32,7 +32,7 @@ def one_line_errors() -> Generator[None]:
         raise
     except Interrupted as error:
         raise ended(error, INTERRUPTED) from error
-    except NotCleared as error:
+    except NotReset as error:
         raise _failed(error, NOT_CLEARED) from error
     except (StandError, OSError) as error:
         raise _failed(error, FAILED) from error

@@ -41,7 +41,7 @@ DONE: dict[str, Action] = {"trip": "abort", "hold": "hold", "warn": "warn"}
 class Fault:
     """What a rule objects to, and what has to be done about it.
 
-    ends_itself: the hold is over when the rule objects no more; else an operator has to clear it. cuts_camera: the
+    ends_itself: the hold is over when the rule objects no more; else an operator has to reset it. cuts_camera: the
     camera's supply is switched off as well. channels: the two that contradict each other, where a rule compares them;
     suspect: which of them moved unlike the rest, "" where that cannot be told.
     """

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 from enum import StrEnum
 
-from thermostand.foundation.events import CAMERA_ENDS, CLEAR, DISK, ROOM, Alert, event
+from thermostand.foundation.events import CAMERA_ENDS, DISK, RESET_ADVICE, ROOM, Alert, event
 
 Listener = Callable[[str, bool], None]
 
@@ -30,7 +30,7 @@ IN_WORDS = {
 _STATUS = "`stand status` says what holds it, and what ends that"
 ENDINGS = {
     OPERATOR: "`stand continue` ends the pause",
-    INTERLOCK: CLEAR,
+    INTERLOCK: RESET_ADVICE,
     CAMERA_LOST: CAMERA_ENDS,
     DISK_LOW: ROOM,
     NOT_RECORDED: DISK,

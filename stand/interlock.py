@@ -12,7 +12,7 @@ from thermostand.stand.latch import Latch
 
 
 class Interlocked(StandTripped):
-    """The guard has made the stand safe and an operator has not cleared it yet: nothing may move meanwhile."""
+    """The guard has made the stand safe and an operator has not reset it yet: nothing may move meanwhile."""
 
 
 class Mover(Protocol):
@@ -38,7 +38,7 @@ class Interlock:
         if STOPPING in self._gate.reasons:
             raise StandTripped(f"the run is being ended: {'stopped' if fault is None else fault.text}")
         if fault is not None:
-            raise Interlocked(f"an interlock holds the stand until it is cleared: {fault.text}")
+            raise Interlocked(f"an interlock holds the stand until it is reset: {fault.text}")
         for mover in self._movers:
             mover.allow()  # what making safe has barred, and bars again should it begin before the command is sent
 

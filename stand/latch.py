@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict
 
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.events import LATCH_NOT_CLEARED, LATCH_NOT_KEPT
+from thermostand.foundation.events import LATCH_NOT_KEPT, LATCH_NOT_RESET
 from thermostand.foundation.files import replace_file, sync_folder
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.sealed import seal, unseal
@@ -51,7 +51,7 @@ class LatchedFault(BaseModel):
 
 
 class Latch:
-    """Of one stand. fault: what it was made safe for and nobody has cleared, None when nothing is. since_ns: when that
+    """Of one stand. fault: what it was made safe for and nobody has reset, None when nothing is. since_ns: when that
     was found. file: what outlives this process; None in virtual time."""
 
     def __init__(self, gate: Gate, hub: Hub, clock: Clock) -> None:
@@ -78,18 +78,18 @@ class Latch:
             self._gate.hold(INTERLOCK)
 
     async def restore(self) -> None:
-        """What a program before this one has left, and nobody has cleared, holds the gate. May wait for a disk."""
+        """What a program before this one has left, and nobody has reset, holds the gate. May wait for a disk."""
         found = None if self.file is None else await asyncio.to_thread(self.file.read)
         if found is not None:
             self.fault, self.since_ns = Fault(found.rule, found.text, "hold"), found.since_ns
             self.bar()
 
-    def clear(self) -> None:
+    def reset(self) -> None:
         """Nothing has tripped any more, and the gate is let go; the disk is waited for as by `trip`."""
         self.fault = None
         self._gate.clear(INTERLOCK)
         if self.file is not None and (failure := self.file.forget()):
-            self._hub.publish(LATCH_NOT_CLEARED.at(self._clock.now_ns(), failure))
+            self._hub.publish(LATCH_NOT_RESET.at(self._clock.now_ns(), failure))
 
 
 class LatchFile:
@@ -108,7 +108,7 @@ class LatchFile:
         return cls(folder / f"{name}{end}" for end in _ENDS for name in names)
 
     def read(self) -> LatchedFault | None:
-        """The fault that nobody has cleared; None when there is none."""
+        """The fault that nobody has reset; None when there is none."""
         found: list[LatchedFault | None] = []
         reading = threading.Thread(target=lambda: found.append(_read(self._paths)), name="stand-latch", daemon=True)
         reading.start()
@@ -121,10 +121,10 @@ class LatchFile:
         return self._bounded(_write, seal(_KIND, text))
 
     def forget(self) -> str:
-        """An operator has cleared it; as `keep`."""
+        """An operator has reset it; as `keep`."""
         return self._bounded(_remove)
 
-    def clear(self) -> None:
+    def reset(self) -> None:
         """As `forget`, however long it takes; SessionError when a file cannot be removed: the stand stays latched."""
         try:
             _remove(self._paths)
@@ -212,5 +212,5 @@ def _remove(paths: tuple[Path, ...]) -> None:
 
 
 def _unreadable(path: Path, why: str | None) -> LatchedFault:
-    text = f"{path} says whether this stand has tripped, and cannot be read ({why}); look at the stand, then clear it"
+    text = f"{path} says whether this stand has tripped, and cannot be read ({why}); look at the stand, then reset it"
     return LatchedFault(rule=UNREADABLE, text=text, since_ns=0)

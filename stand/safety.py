@@ -170,7 +170,7 @@ class Safety:
         self._makers = (*self._makers, _Maker(actuator, pause_s, self._clock, self._on_change))
 
     def take_until_cleared(self, actuator: Harmful) -> None:
-        """As `take`, until an operator clears the hold."""
+        """As `take`, until an operator resets the hold."""
         if actuator not in self._until_cleared:
             self.take(actuator)
             self._until_cleared[actuator] = self._makers[-1]
@@ -190,7 +190,7 @@ class Safety:
         self._given_up = False
 
     def forgive(self) -> None:
-        """An operator has cleared the hold: what is not confirmed is tried no more, or it would undo what the run does
+        """An operator has reset the hold: what is not confirmed is tried no more, or it would undo what the run does
         from now on."""
         for maker in self._makers:
             maker.forgive()

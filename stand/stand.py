@@ -132,7 +132,7 @@ class Stand:
 
     def cut_camera(self) -> None:
         """The camera itself is too warm: its supply goes off, too, whenever the stand is made safe, until an operator
-        clears the hold."""
+        resets the hold."""
         self.imaging.supply.is_on = False
         self.safety.take_until_cleared(self.imaging.supply)
         self.safety.demand()

@@ -128,7 +128,7 @@ class Recorder:
         self._homes.beside.append(file)
 
     def refound(self) -> None:
-        """An operator has cleared the loss of the folder: continue in it, or in a new one at its place, with continued
+        """An operator has reset the loss of the folder: continue in it, or in a new one at its place, with continued
         numbers. Returns at once."""
         self._homes.refind()
 

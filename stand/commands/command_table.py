@@ -50,7 +50,7 @@ app = lazy_app(
             "thermostand.stand.commands.foxglove_cli", "Show a running stand live in Foxglove or Lichtblick."
         ),
         **_verbs(),
-        "clear": Lazy(_CONTROL, "Continue a run that an interlock holds, once you have removed the cause."),
+        "reset": Lazy(_CONTROL, "Continue a run that an interlock holds, once you have removed the cause."),
         "check": Lazy(
             "thermostand.stand.commands.check_cli",
             "Check each device of a stand: connected, the right unit, its settings, a reading.",

@@ -1,4 +1,4 @@
-"""The commands that look at a run under way, and `clear`, which a stand without a daemon has, too."""
+"""The commands that look at a run under way, and `reset`, which a stand without a daemon has, too."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def status(
     """Show what the run under way is doing: step, state, expected end, temperatures, frames, disk, last warning.
 
     Without DIR, when none runs in recording.directory: the only one on this machine. The same for `stand stop`. When
-    nothing runs: whether the stand of --config has tripped, and nobody has cleared it.
+    nothing runs: whether the stand of --config has tripped, and nobody has reset it.
 
     Example: stand status /data/sessions
     """
@@ -97,7 +97,7 @@ def watch(server: Server) -> None:
 
 
 @app.command()
-def clear(
+def reset(
     directory: DirectoryArgument = None,
     config: ConfigOption = "simulated",
     url: UrlOption = "",
@@ -107,18 +107,18 @@ def clear(
 
     Without a daemon: what an earlier run or daemon has left latched of the stand of --config.
 
-    Example: stand clear
+    Example: stand reset
     """
     try:
         server = reached(directory, config, url, token_file)
     except SessionError:
-        if url or directory is not None or not _cleared_here(config):
+        if url or directory is not None or not _reset_here(config):
             raise
         return
-    answer = order(server, "clear")
-    again, text = _held_again(server), str(answer.get("text") or "cleared")
+    answer = order(server, "reset")
+    again, text = _held_again(server), str(answer.get("text") or "reset")
     if again is not None:
-        text = f"cleared; held again: {again.rule}: {again.text}"
+        text = f"reset; held again: {again.rule}: {again.text}"
         _say(server, {**answer, "text": text, "reasons": [INTERLOCK]}, f"{text}; {ENDINGS[INTERLOCK]}")
     else:
         held = (
@@ -130,7 +130,7 @@ def clear(
 
 
 def _held_again(server: Server) -> FaultState | None:
-    """What the guard, or a step that is done again, has met within a moment of a clear."""
+    """What the guard, or a step that is done again, has met within a moment of a reset."""
     for _ in range(round(_AGAIN_S / _LOOK_S)):
         if (fault := server.state().fault) is not None:
             return fault
@@ -146,24 +146,24 @@ def _left_latched(config: str) -> LatchedFault | None:
     return latch_file(load_config(packaged("", config))).read()
 
 
-def _cleared_here(config: str) -> bool:
+def _reset_here(config: str) -> bool:
     """Whether the stand, which no program has, was latched, and is so no longer; InUse when one has it."""
     import asyncio
 
     from thermostand.stand.config.stand_config import load_config, packaged
     from thermostand.stand.running.opening.claim import claimed, latch_file
 
-    async def cleared() -> bool:
+    async def reset() -> bool:
         stand = load_config(packaged("", config))
-        async with claimed(stand, None, "stand clear"):
+        async with claimed(stand, None, "stand reset"):
             latch = await asyncio.to_thread(latch_file, stand)
             fault = await asyncio.to_thread(latch.read)
             if fault is not None:
-                await asyncio.to_thread(latch.clear)
-                show(fault.model_dump(), [f"cleared: {one_line(fault.text)}"])
+                await asyncio.to_thread(latch.reset)
+                show(fault.model_dump(), [f"reset: {one_line(fault.text)}"])
             return fault is not None
 
-    return asyncio.run(cleared())
+    return asyncio.run(reset())
 
 
 def _say(server: Server, answer: Mapping[str, object], text: str) -> None:
@@ -183,7 +183,7 @@ def _show(server: Server, state: StandState) -> None:
 def _next(state: StandState) -> Iterator[str]:
     """What ends what holds the stand."""
     if state.fault is not None:
-        ended = {} if state.run is not None else {"action": "hold"}  # a run that has tripped is over: to be cleared
+        ended = {} if state.run is not None else {"action": "hold"}  # a run that has tripped is over: to be reset
         yield next_command(f"guard.{state.fault.rule}", {**state.fault.data, **ended})
     for reason in sorted({*state.reasons, *(() if state.run is None else state.run.reasons)} - {INTERLOCK, STOPPING}):
         yield next_command(HELD, {"reason": reason})

@@ -36,7 +36,7 @@ def list_runs(server: Server) -> None:
     if not state.queue:
         say(f"{server.name}: nothing is queued there")
     if state.queue_halted:
-        say(f"halted by {state.queue_halted}; remove the cause, then `stand clear`")
+        say(f"halted by {state.queue_halted}; remove the cause, then `stand reset`")
 
 
 def queue_lines(runs: Sequence[QueuedRun]) -> list[str]:

@@ -137,8 +137,8 @@ def _check_seed(seed: int | None, *, virtual_time: bool) -> None:
 def resume_run(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="The session of a run that did not end.")],
     config: ConfigOption = "simulated",
-    clear: Annotated[
-        bool, typer.Option("--clear", help="Clear a trip first; only when its cause has been removed.")
+    reset: Annotated[
+        bool, typer.Option("--reset", help="Reset a trip first; only when its cause has been removed.")
     ] = False,
     attended: AttendedOption = False,
     report: ReportOption = False,
@@ -150,7 +150,7 @@ def resume_run(
 
     Example: stand resume sessions/20260101T180000Z-thermal-cycle --config laboratory.yaml
     """
-    before = interruption(directory, load_config(packaged("", config)), clear=clear)
+    before = interruption(directory, load_config(packaged("", config)), reset=reset)
     order = replace(before.order, attended=attended)
     before = replace(before, order=order)
     try:

@@ -147,7 +147,7 @@ def folders(group: str) -> str:
     """Where the locks of this machine's stands lie (presence.lock_folder)."""
     return f"""# The locks of stands: only their operators may take one
 d {STANDS_FOLDER} 2770 root {group} -
-# What has tripped, and nobody has cleared
+# What has tripped, and nobody has reset
 d {SYSTEM_FOLDER} 2770 root {group} -
 """
 

@@ -79,9 +79,9 @@ class GuardConfig(Document):
     """When the guard makes the stand safe. The upper bounds are what the chamber survives: no file may lift them.
 
     panel_change_grace_s: how long the unit and this program may differ about running, permits and the set-point, as
-    when somebody changes them at its panel. flap_open_s: how long the flap may be open outside captures, flap_capture_s in
-    all. disk_low_s: how long the recorder may refuse frames. camera_temperature_s: how long a powered camera with
-    frames to come may have no temperature.
+    when somebody changes them at its panel. flap_open_s: how long the flap may be open outside captures;
+    flap_capture_s: in all. disk_low_s: how long the recorder may refuse frames. camera_temperature_s: how long a
+    powered camera with frames to come may have no temperature.
     pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
     hours. overrides: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
     channels: limits for what any device measures, by its channel, as `lab.pressure`.

@@ -97,7 +97,7 @@ class Guard:
 
     @property
     def held(self) -> Fault | None:
-        """What the stand was made safe for, and nobody has cleared."""
+        """What the stand was made safe for, and nobody has reset."""
         return self.latch.fault
 
     @property
@@ -107,7 +107,7 @@ class Guard:
         return not self._ended and self._looked_ns is not None and now_ns - self._looked_ns <= late_ns
 
     def begin_again(self) -> None:
-        """The latch was cleared: every grace time begins again, and what was met is forgotten."""
+        """The latch was reset: every grace time begins again, and what was met is forgotten."""
         self.met.cleared()
         for watch in self.watches:
             watch.since_ns = None
@@ -117,7 +117,7 @@ class Guard:
         self._follow_hold(self._faults())
 
     def still_wrong(self) -> str:
-        """For who has just cleared: what holds the stand again, or will once it has lasted for its grace time; "" when
+        """For who has just reset: what holds the stand again, or will once it has lasted for its grace time; "" when
         no rule objects to anything."""
         if self.held is not None:
             return f"held again: {self.held.text}"
@@ -190,7 +190,7 @@ class Guard:
         if self.release is None or len(self._endings_ns) >= _ENDINGS_PER_H:
             text = (
                 f"{fault.text}; this has held the stand more than {_ENDINGS_PER_H} times in an hour, so it stays held: "
-                "`stand clear` continues"
+                "`stand reset` continues"
             )
             self.latch.trip(Fault(fault.rule, text, fault.action))
             self.hub.publish(HOLD_STAYS.at(now_ns, text, **data))

@@ -42,7 +42,7 @@ HEAT_UNCONTROLLED = guard_rule("heat_uncontrolled", "the heat reads back other t
 NOT_RECORDED = guard_rule("not_recorded", "what was measured is not on the disk in time")
 FOLDER_LOST = guard_rule("folder_lost", "the folder of the session is not there any more")
 RECORDING_ENDED = guard_rule("recording_ended", "the process that writes the session has ended")
-_CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to clear that
+_CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator must be able to reset that
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
 
 

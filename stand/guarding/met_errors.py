@@ -26,7 +26,7 @@ DEVICE_LOST = guard_rule("device_lost", "a step met a device that does not answe
 @dataclass(frozen=True, slots=True)
 class _Row:
     """kind: of device (stand.assembly.device_kinds), "" for any. ends_itself: when the device is read again; else an
-    operator has to clear it."""
+    operator has to reset it."""
 
     kind: str
     error: type[DeviceError]

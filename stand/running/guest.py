@@ -14,14 +14,14 @@ from pathlib import Path
 from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock, VirtualClock, boot_of, seconds_ns, utc_offset_ns
 from thermostand.foundation.documents import parse_document
-from thermostand.foundation.errors import DeviceError, NotCleared, StandTripped
+from thermostand.foundation.errors import DeviceError, NotReset, StandTripped
 from thermostand.foundation.events import (
     AT_AMBIENT,
-    CLEARED,
     FRAMES_RESUMED,
     FRAMES_STOPPED,
     GAP,
     NOT_AT_AMBIENT,
+    RESET,
     RUN_END,
     RUN_RESUME,
     RUN_START,
@@ -49,7 +49,7 @@ from thermostand.stand.running.executing.camera_gap import OffsetGap, OffsetWatc
 from thermostand.stand.running.executing.deciding import Decider
 from thermostand.stand.running.executing.executor import Executor
 from thermostand.stand.running.executing.settling_watch import SettlingWatch, load_for
-from thermostand.stand.running.memory.entries import Cleared, Ended, Gap, Written
+from thermostand.stand.running.memory.entries import Ended, Gap, Reset, Written
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import Journal, Logbook
 from thermostand.stand.running.opening.holds import end_endless_holds
@@ -336,8 +336,8 @@ class Guest:
         now_ns, before = self._assembly.clock.now_ns(), self.job.before
         if before is None:
             return (begun(self.job.order, self.recorder.directory.name, now_ns, self.job.seed),)
-        cleared = (Cleared(now_ns),) if before.state.tripped else ()
-        return (*cleared, Gap(before.last_ns, now_ns))
+        reset = (Reset(now_ns),) if before.state.tripped else ()
+        return (*reset, Gap(before.last_ns, now_ns))
 
     def _tell_interruption(self, before: Interruption) -> None:
         """The end of the run that was interrupted, the gap since, and that it is resumed."""
@@ -349,7 +349,7 @@ class Guest:
         to_utc_ns = now_ns + utc_offset_ns(clock)
         log.tell(GAP, duration(now_ns - before.last_ns), from_ns=last_utc_ns, to_ns=to_utc_ns)
         if before.state.tripped:
-            log.tell(CLEARED, str(before.state.tripped))
+            log.tell(RESET, str(before.state.tripped))
         version = importlib.metadata.version("thermostand")
         log.tell(RUN_RESUME, version=version, steps_done=len(before.kept.done), **self._begin_data())
 
@@ -374,7 +374,7 @@ def _ending(fault: Fault | None, error: BaseException) -> Ended:
     """How a run ended that did not come to its end."""
     if fault is None:
         cause = cause_of(error)
-        if isinstance(cause, NotCleared):
+        if isinstance(cause, NotReset):
             return Ended(0, "tripped", f"aborted: {cause}")
         reason = "cancelled" if isinstance(cause, asyncio.CancelledError) else failure_text(cause)
         return Ended(0, "failed", f"failed: {reason}")

@@ -69,7 +69,7 @@ class Interruption:
     """A run that may be resumed. Its journal is open, and so locked, until it is run or `release`d.
 
     state: by journal and recording. last_ns: the last instant on the disk. seed: of the simulated laboratory.
-    tripped: what an operator has cleared. salvaged: what had to be finished first. camera: what the session records of
+    tripped: what an operator has reset. salvaged: what had to be finished first. camera: what the session records of
     it. utc_offset_ns: UTC minus the stand's clock at last_ns, as it is recorded. differences: between the configuration
     of the session and that of this stand, with which it is resumed.
     """
@@ -105,28 +105,28 @@ def repaired(directory: Path) -> tuple[Salvaged, ...]:
     return tuple(segment for segment in found if segment.reason != BEING_RECORDED)
 
 
-def interruption(directory: Path, own: StandConfig | None = None, *, clear: bool = False) -> Interruption:
+def interruption(directory: Path, own: StandConfig | None = None, *, reset: bool = False) -> Interruption:
     """What is needed to resume the run recorded in `directory` on this stand, the installed simulated one when no
     `own` is given; its unfinished segments are salvaged.
 
     ConfigError when only one of the two stands is simulated. SessionError when a daemon is running it, it is complete,
-    it tripped and `clear` is not given, or journal, recording and this version of the program do not belong together.
+    it tripped and `reset` is not given, or journal, recording and this version of the program do not belong together.
     """
     journal, entries = Journal.open(directory)
     try:
-        return _interruption(directory, journal, entries, own or default_stand(), clear)
+        return _interruption(directory, journal, entries, own or default_stand(), reset)
     except BaseException:
         journal.release()
         raise
 
 
 def _interruption(
-    directory: Path, journal: Journal, entries: list[Written], own: StandConfig, clear: bool
+    directory: Path, journal: Journal, entries: list[Written], own: StandConfig, reset: bool
 ) -> Interruption:
     first = entries[0] if entries else None
     if not entries or not (isinstance(first, Begun) or journal.damage):
         raise SessionError(f"{directory}: its run had not begun when it was killed; begin a new run")
-    _check_may_go_on(directory, folded((), entries), clear)
+    _check_may_go_on(directory, folded((), entries), reset)
     with late_progress("salvage", 1.0) as report:
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
@@ -134,7 +134,7 @@ def _interruption(
     lost = _recorded_end(session, entries)
     items = (*session.steps(), *session.events())
     without_frames = (*with_recorded(entries, items, ()), *lost)
-    _check_may_go_on(directory, folded((), without_frames), clear)
+    _check_may_go_on(directory, folded((), without_frames), reset)
     order = _order(session, begun)
     plan = folded(order.recipe.plan(), without_frames).plan
     all_entries = (*with_recorded(entries, items, _recorded_frames(session, plan)), *lost)
@@ -176,12 +176,12 @@ def folded(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
         raise SessionError(f"{JOURNAL_NAME}: no run has written such entries ({error}); begin a new run") from error
 
 
-def _check_may_go_on(directory: Path, state: RunState, clear: bool) -> None:
-    """SessionError when the run is complete, or has tripped and was not cleared."""
+def _check_may_go_on(directory: Path, state: RunState, reset: bool) -> None:
+    """SessionError when the run is complete, or has tripped and was not reset."""
     if state.ended is not None and state.ended.status == RunOutcome.COMPLETE:
         raise SessionError(f"{directory}: its run is complete; there is nothing to resume")
-    if state.tripped and not clear:
-        raise SessionError(f"{directory}: the stand tripped: {state.tripped}; look into it, then resume with --clear")
+    if state.tripped and not reset:
+        raise SessionError(f"{directory}: the stand tripped: {state.tripped}; look into it, then resume with --reset")
 
 
 def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Iterable[tuple[int, str]]) -> list[Entry]:

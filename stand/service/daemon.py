@@ -26,7 +26,7 @@ from thermostand.foundation.events import (
     NOT_RESUMED,
     QUEUE,
     QUEUE_EMPTY,
-    QUEUE_NOT_CLEARED,
+    QUEUE_STILL_HALTED,
     RECORDING_RESTARTED,
     RUN_END,
     RUN_FAILED,
@@ -149,9 +149,9 @@ class Daemon(Host):
         """Counters are kept for the next start."""
         self._keep.note(KeptCounters(counters=dict(self.counters.values)))
 
-    def clear_queue(self) -> None:
+    def reset_queue(self) -> None:
         """What halted it has been looked into."""
-        self._beside(self._clear_queue())
+        self._beside(self._reset_queue())
 
     async def serve(self, front: Front) -> None:
         """Until `leave`; then the stand is safe. Raises what makes that impossible."""
@@ -228,12 +228,12 @@ class Daemon(Host):
                 await self._orders.read()
 
     async def _restart_recording(self) -> None:
-        """What an operator would do after the process that writes a run's session was killed: clear, and resume."""
+        """What an operator would do after the process that writes a run's session was killed: reset, and resume."""
         if self._orders.leaving or self._assembly.stand.safety.unconfirmed:
             return
         if not self._restarts.may_follow(self.open_stand.latch.fault, self._clock.now_ns()):
             return
-        self.open_stand.clear()
+        self.open_stand.reset()
         self.note()
         if self.open_stand.latch.fault is not None:  # something else is wrong, too
             return
@@ -319,8 +319,8 @@ class Daemon(Host):
             if orders.leaving:
                 raise
             follows = any(each.is_open for each in orders.queued.entries)
-            clear = "; the next of the queue begins when the stand is cleared" if follows else ""
-            raise Stopped(f"{error}; it may be resumed{clear}", halts=follows) from error
+            reset = "; the next of the queue begins when the stand is reset" if follows else ""
+            raise Stopped(f"{error}; it may be resumed{reset}", halts=follows) from error
         finally:
             orders.stop = None
             hub.unsubscribe(watch)
@@ -339,7 +339,7 @@ class Daemon(Host):
             salvaged = await self._orders.repair.call(repaired, session)
         except SessionError as error:
             raise Halt(str(error)) from error
-        before = await self._orders.reading.call(partial(interruption_of, session, config, clear=True))
+        before = await self._orders.reading.call(partial(interruption_of, session, config, reset=True))
         return replace(before, salvaged=(*salvaged, *before.salvaged))
 
     async def _record_day(self) -> None:
@@ -441,11 +441,11 @@ class Daemon(Host):
                 systemd.tell(systemd.FED)
             await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(every_s))
 
-    async def _clear_queue(self) -> None:
+    async def _reset_queue(self) -> None:
         try:
-            await self._orders.clear()
+            await self._orders.reset()
         except SessionError as error:
-            self._tell(QUEUE_NOT_CLEARED, str(error))
+            self._tell(QUEUE_STILL_HALTED, str(error))
         self.wake()
 
     def check_heat(self) -> None:

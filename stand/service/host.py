@@ -85,7 +85,7 @@ class Host:
         if self.has_run:
             return "a run has the stand; pause does not change that, STOP ends the run"
         if (fault := self.open_stand.latch.fault) is not None:
-            return f"the stand has tripped: {fault.text}; clear it once the cause is removed"
+            return f"the stand has tripped: {fault.text}; reset it once the cause is removed"
         reasons = self._assembly.stand.gate.reasons
         return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
 
@@ -129,7 +129,7 @@ class Host:
     def note(self) -> None:
         """Write down what the next one who has the stand has to know."""
 
-    def clear_queue(self) -> None:
+    def reset_queue(self) -> None:
         """A queue that was halted goes on."""
 
     def _tell(self, kind: EventKind, said: str = "", /, **data: object) -> None:

@@ -79,9 +79,9 @@ class Orders:
             await self.disk.call(queue.halt, self.directory, reason)
             await self.read()
 
-    async def clear(self) -> None:
+    async def reset(self) -> None:
         """The queue may continue."""
-        await self.disk.call(queue.clear, self.directory)
+        await self.disk.call(queue.reset, self.directory)
         await self.read()
 
     async def submit(self, who: Who, request: RunRequest, key: str) -> QueueEntry:
@@ -107,7 +107,7 @@ class Orders:
         entry = self._entry(number)
         await self._changed(queue.remove, number)
         if entry.state is QueueState.INTERRUPTED and not any(each.is_open for each in self.queued.entries):
-            await self.clear()
+            await self.reset()
 
     async def move(self, number: int, to: int) -> None:
         """Make it the `to`-th of those to be done."""

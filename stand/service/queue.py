@@ -103,12 +103,12 @@ def remove(directory: Path, number: int) -> QueueEntry:
 def take(directory: Path, now_ns: int) -> QueueEntry | None:
     """The next run, marked as running, as it was before: an interrupted one has its session. None when all are done.
 
-    StandTripped when the queue was halted and no operator has cleared it.
+    StandTripped when the queue was halted and no operator has reset it.
     """
     with changing(directory) as draft:
         queue = draft.queue
         if queue.halted:
-            remedy = "remove the cause, then `stand clear`"
+            remedy = "remove the cause, then `stand reset`"
             raise StandTripped(f"{directory}: the queue was halted: {queue.halted}; {remedy}")
         running = next((entry for entry in queue.entries if entry.state is QueueState.RUNNING), None)
         if running is not None:
@@ -158,7 +158,7 @@ def halt(directory: Path, reason: str) -> None:
 
 def put_first(directory: Path, entry: QueueEntry, session: str) -> QueueEntry:
     """Resume the run of that session next: an entry that has it is interrupted again, else `entry` is. What halted the
-    queue is cleared: an operator has asked for this."""
+    queue is reset: an operator has asked for this."""
     with changing(directory) as draft:
         found = next((each for each in reversed(draft.queue.entries) if each.session == session), None)
         known: dict[str, object] = {"id": draft.queue.next_id, "began_ns": entry.added_ns}
@@ -171,7 +171,7 @@ def put_first(directory: Path, entry: QueueEntry, session: str) -> QueueEntry:
     return entry
 
 
-def clear(directory: Path) -> None:
-    """An operator clears a halted queue."""
+def reset(directory: Path) -> None:
+    """An operator resets a halted queue."""
     with changing(directory) as draft:
         draft.set(halted="")

@@ -196,10 +196,10 @@ class StepWatch:
             self._step_done()
 
 
-def interruption_of(session: Path, own: StandConfig, *, clear: bool = False) -> Interruption:
+def interruption_of(session: Path, own: StandConfig, *, reset: bool = False) -> Interruption:
     """What is left of the run of a session, for this stand; Halt when it cannot be resumed."""
     try:
-        return interruption(session, own, clear=clear)
+        return interruption(session, own, reset=reset)
     except (SessionError, ConfigError) as error:
         raise Halt(str(error)) from error
 

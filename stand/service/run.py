@@ -300,8 +300,8 @@ async def _kept_on(job: Job, front: Front, clock: WallClock) -> Path:
         finally:
             if job.before is not None:
                 job.before.release()
-        await asyncio.to_thread(latch_file(job.order.config).clear)
-        before = await asyncio.to_thread(partial(interruption, directory, job.order.config, clear=True))
+        await asyncio.to_thread(latch_file(job.order.config).reset)
+        before = await asyncio.to_thread(partial(interruption, directory, job.order.config, reset=True))
         order = replace(before.order, attended=job.order.attended)
         before = replace(before, order=order)
         job, clock = replace(job, order=order, before=before, begun=_nobody), WallClock(before.last_ns + 1)
@@ -382,14 +382,14 @@ async def _run(job: Job, front: Front, clock: Clock, time: Time | None, stop: St
 
 
 def _check_latch(job: Job) -> None:
-    """StandTripped when the stand has tripped and nobody has cleared it; a run that is resumed after its trip was
-    cleared clears it."""
+    """StandTripped when the stand has tripped and nobody has reset it; a run that is resumed after its trip was
+    reset resets it."""
     latch = latch_file(job.order.config)
     if job.before is not None and job.before.state.tripped:
-        latch.clear()
+        latch.reset()
     elif (fault := latch.read()) is not None:
         since = f" at {utc_text(fault.since_ns)}" if fault.since_ns else ""
-        raise StandTripped(f"the stand has tripped{since}: {fault.text}; remove the cause, then `stand clear`")
+        raise StandTripped(f"the stand has tripped{since}: {fault.text}; remove the cause, then `stand reset`")
 
 
 def _directory(job: Job, clock: Clock) -> Path:

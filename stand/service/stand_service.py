@@ -223,17 +223,17 @@ class StandService(Served):
         self._running().go_on()
         return held_text(self._assembly.stand.gate.reasons)
 
-    @command("/run/clear", verbs=())
-    def clear(self, who: Who) -> str:
+    @command("/run/reset", verbs=())
+    def reset(self, who: Who) -> str:
         """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
         host, orders = self.host, self.host.orders
         if self._open_stand.latch.fault is None and (orders is None or not orders.queued.halted):
-            raise Conflict(f"there is nothing to clear: no interlock holds this {'run' if orders is None else 'stand'}")
-        still = self._open_stand.clear()
+            raise Conflict(f"there is nothing to reset: no interlock holds this {'run' if orders is None else 'stand'}")
+        still = self._open_stand.reset()
         host.note()
         if self._open_stand.latch.fault is None:
-            host.clear_queue()
-        return f"cleared; {still}" if still else "cleared"
+            host.reset_queue()
+        return f"reset; {still}" if still else "reset"
 
     @command("/run/skip")
     async def skip(self, who: Who, given: SkipRequest) -> str:
@@ -301,7 +301,7 @@ class StandService(Served):
         """Resume an interrupted run in its session; it is the next one."""
         orders = self._orders()
         if self._open_stand.latch.fault is not None:
-            raise Conflict("the stand has tripped; clear it first")
+            raise Conflict("the stand has tripped; reset it first")
         entry = await orders.resume(given.session)
         self.host.wake()
         return f"run {entry.id} is resumed next"

@@ -175,9 +175,9 @@ class ADesk(StandService):
         self.gate.clear(OPERATOR)
         return held_text(self.gate.reasons)
 
-    def clear(self, who: Who) -> str:
+    def reset(self, who: Who) -> str:
         if INTERLOCK not in self.gate.reasons:
-            raise Conflict("there is nothing to clear: no interlock holds this run")
+            raise Conflict("there is nothing to reset: no interlock holds this run")
         self.gate.clear(INTERLOCK)
         return ""
 

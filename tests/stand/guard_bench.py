@@ -79,13 +79,13 @@ class Bench:
     def clear(self) -> None:
         """As an operator does."""
         if self.latch.fault is not None:
-            self.latch.clear()
+            self.latch.reset()
             self.guard.begin_again()
             self.guard.hold_again()
 
     def _release(self) -> None:
         self.log.append("release")
-        self.latch.clear()
+        self.latch.reset()
 
     def _rule(self, index: int) -> Rule:
         def rule(readings: Readings, now_ns: int) -> Fault | None:

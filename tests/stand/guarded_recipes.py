@@ -40,7 +40,7 @@ EVERY_S = 7000.0  # an interruption
 @dataclass
 class Player:
     """A recipe's steps as actions on a chamber. With `interrupted` something comes between them every EVERY_S, in turn:
-    a hold that is cleared by itself, a pause, a camera that was off for a minute."""
+    a hold that is reset by itself, a pause, a camera that was off for a minute."""
 
     recipe: str
     interrupted: bool

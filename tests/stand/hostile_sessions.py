@@ -347,14 +347,12 @@ ROWS: dict[str, Row] = {
         lambda s: ((s / "journal.jsonl").unlink(), (s / "journal.jsonl").mkdir()), INCOMPLETE
     ),
     "a deep journal": Row(lambda s: journal(s, DEEP.encode()), SOUND),
-    "a journal of huge numbers": Row(
-        lambda s: journal(s, b'{"entry": "Cleared", "time_ns": %s}' % (b"9" * 5000)), SOUND
-    ),
-    "a journal of no numbers": Row(lambda s: journal(s, b'{"entry": "Cleared", "time_ns": NaN}'), SOUND),
+    "a journal of huge numbers": Row(lambda s: journal(s, b'{"entry": "Reset", "time_ns": %s}' % (b"9" * 5000)), SOUND),
+    "a journal of no numbers": Row(lambda s: journal(s, b'{"entry": "Reset", "time_ns": NaN}'), SOUND),
     "a journal of wrong types": Row(lambda s: journal(s, b'{"entry": ["Step"], "time_ns": {}}', b"[]", b"7"), SOUND),
     "a journal that is not UTF-8": Row(lambda s: journal(s, b'{"entry": "\xff\xfe"}'), SOUND),
     "a journal of 9 MB": Row(
-        lambda s: journal(s, *[b'{"entry": "Cleared", "time_ns": 1}'] * 200_000), SOUND, nightly=True
+        lambda s: journal(s, *[b'{"entry": "Reset", "time_ns": 1}'] * 200_000), SOUND, nightly=True
     ),
     # what is attached and stated
     "a configuration of aliases": Row(configured(aliases()), SOUND),

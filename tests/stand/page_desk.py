@@ -204,8 +204,8 @@ class NightDesk(ADesk):
         self.prompt, self.pausing = None, False
         return super().continue_(who)
 
-    def clear(self, who: Who) -> str:
-        done = super().clear(who)
+    def reset(self, who: Who) -> str:
+        done = super().reset(who)
         self.tripped = None
         return done
 

@@ -41,7 +41,7 @@ async def take(folder: Path) -> None:
                         await page.screenshot(path=folder / f"{name}.png")
                 desk.trip()
                 async with a_page(chromium, port, "now", WIDE, "dark") as page:
-                    await page.get_by_role("button", name="Look at it and clear").click()
+                    await page.get_by_role("button", name="Look at it and reset").click()
                     await page.wait_for_timeout(2000)
                     await page.screenshot(path=folder / "page-tripped.png")
                 desk.clear(Who(name="anna", how="loopback"))

@@ -136,7 +136,7 @@ def test_an_error_is_json_where_that_was_asked_for(program: str, words: str, sta
 # What each command is told besides the session that is not there.
 OF_A_SESSION = {
     "stand resume": "",
-    **{f"stand {verb}": "" for verb in ("status", "watch", "foxglove", "pause", "continue", "clear", "stop")},
+    **{f"stand {verb}": "" for verb in ("status", "watch", "foxglove", "pause", "continue", "reset", "stop")},
     **{f"stand {verb}": "" for verb in ("session list", "session info", "session verify", "session repair")},
     "stand session replay": "",
     "stand session note": "a note",

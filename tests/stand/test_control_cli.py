@@ -131,13 +131,13 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         assert desk.gate.reasons == {"operator", "interlock"}
         held = (await invoke("continue", tmp_path)).stdout
         assert "still held: interlock" in held
-        assert (await invoke("clear", tmp_path)).stdout.startswith(f"{path}: cleared; ")
-        nothing = await invoke("clear", tmp_path)
+        assert (await invoke("reset", tmp_path)).stdout.startswith(f"{path}: reset; ")
+        nothing = await invoke("reset", tmp_path)
         assert nothing.exit_code == 1
-        assert "nothing to clear" in nothing.stderr
+        assert "nothing to reset" in nothing.stderr
         desk.gate.hold("interlock")
         desk.tripped = FaultState(rule="stage_alarm", text="the stage is in alarm", since_ns=0)
-        again = await invoke("clear", tmp_path)
+        again = await invoke("reset", tmp_path)
         assert "held again: stage_alarm" in again.stdout
         assert "step under way" in (await invoke("pause", tmp_path, "--at-next-step")).stdout
         assert (await invoke("skip", "1", tmp_path)).stdout == f"{path}: step 1 is left out\n"
@@ -148,8 +148,8 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
     assert orders == [
         ("pause", {"when": "now"}),
         ("continue", {}),
-        ("clear", {}),
-        ("clear", {}),
+        ("reset", {}),
+        ("reset", {}),
         ("pause", {"when": "step"}),
         ("skip", {"step_id": "1"}),
         ("extend", {"step_id": "0-soak", "by_s": 1800.0}),

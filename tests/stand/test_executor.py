@@ -87,7 +87,7 @@ def begun(tmp_path: Path) -> Iterator[Callable[..., Here]]:
         assert here.life.wrong == []
 
 
-def clear(here: Here) -> None:
+def reset(here: Here) -> None:
     here.life.call(lambda: here.life.stand.gate.clear(INTERLOCK))
 
 
@@ -102,7 +102,7 @@ def test_a_capture_that_was_held_shortly_is_taken_again_only_if_making_ready_tak
     here.life.interlock()
     here.life.publish_pv(chamber_degC)
     here.life.passes(10.0)
-    clear(here)
+    reset(here)
     here.life.passes(2.0)
     here.life.publish_pv(24.0)
     here.life.passes(600.0)
@@ -131,7 +131,7 @@ def test_a_device_error_of_a_step_that_the_guard_holds_for_is_met_once_and_the_s
     here.life.passes(20.0)
     assert [type(error) for error in met] == [Unreachable]
     assert not here.life.run.done()
-    clear(here)
+    reset(here)
     here.life.passes(1000.0)
     assert here.life.run.done()
     assert here.life.run.exception() is None

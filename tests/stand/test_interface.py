@@ -163,10 +163,10 @@ async def test_an_operator_holds_releases_clears_and_stops_the_run(tmp_path: Pat
 
         assert (await do("pause"))["reasons"] == ["interlock", "operator"]
         assert (await do("continue"))["reasons"] == ["interlock"]  # no reason takes another's place
-        assert (await do("clear"))["reasons"] == []
-        with pytest.raises(SessionError, match="nothing to clear"):
-            await do("clear")
+        assert (await do("reset"))["reasons"] == []
+        with pytest.raises(SessionError, match="nothing to reset"):
+            await do("reset")
         assert await asyncio.to_thread(ask_status, tmp_path) == STATUS
-        assert [verb for _, verb, _ in desk.orders] == ["pause", "continue", "clear"]
+        assert [verb for _, verb, _ in desk.orders] == ["pause", "continue", "reset"]
         await do("stop")
         assert [verb for _, verb, _ in desk.orders][-1] == "stop"

@@ -25,7 +25,7 @@ lost with it."""
 class Broken(ADesk):
     """A desk of which one command fails in a way that nobody has thought of."""
 
-    def clear(self, who):
+    def reset(self, who):
         raise ZeroDivisionError("nobody has thought of it")
 
 
@@ -131,7 +131,7 @@ async def test_what_fails_is_answered_with_a_sentence_published_as_an_event_and_
     desk.hub.subscribe(lambda item: events.append(getattr(item, "text", "")))
     async with served(desk, tmp_path / "night", Interface(tmp_path, port=port)):
         for _ in range(3):
-            status, text = await asyncio.to_thread(answered, port, "POST", "/api/v1/run/clear", "", {}, b"")
+            status, text = await asyncio.to_thread(answered, port, "POST", "/api/v1/run/reset", "", {}, b"")
             assert (status, "ZeroDivisionError" in json.loads(text)["error"]) == (500, True)
         assert (await asyncio.to_thread(answered, port, "GET", "/healthz", "", {}, b""))[0] == 200
         await asyncio.sleep(0)

@@ -50,7 +50,7 @@ entries = st.one_of(
     st.builds(Held, times_ns, words, st.booleans()),
     st.builds(Gap, times_ns, times_ns),
     st.builds(Tripped, times_ns, words, words),
-    st.builds(Cleared, times_ns),
+    st.builds(Reset, times_ns),
     st.builds(Ended, times_ns, st.sampled_from(["complete", "failed"]), words),
 )
 
@@ -133,7 +133,7 @@ def test_a_damaged_line_is_reported_and_kept_aside_and_the_lines_after_it_count(
 
 
 def test_lines_of_another_place_or_journal_do_not_count(tmp_path):
-    """A sector that the disk wrote elsewhere holds whole lines with right CRCs: one may clear a trip."""
+    """A sector that the disk wrote elsewhere holds whole lines with right CRCs: one may reset a trip."""
     path, other = new_journal(tmp_path, *ENTRIES), lines_with(ENTRIES, mark=b"0badf00d")
     whole = path.read_bytes()
     lines = whole.splitlines(keepends=True)

@@ -276,7 +276,7 @@ async def test_every_view_is_accessible(night):
     night.trip()
     night.ask_operator("Roll the camera by 20 degrees")
     async with a_page(night.chromium, night.port) as page:
-        await page.get_by_role("button", name="Look at it and clear").click()
+        await page.get_by_role("button", name="Look at it and reset").click()
         await page.evaluate(AXE_SCRIPT)
         for view in VIEWS:
             await page.goto(f"http://127.0.0.1:{night.port}/#{view}")

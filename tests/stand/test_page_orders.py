@@ -103,7 +103,7 @@ async def test_nothing_ever_lies_over_stop(night, size):
         night.trip()
         night.ask_operator("Roll the camera by 20 degrees")
         await page.get_by_text("The run waits for you").wait_for()
-        await page.get_by_role("button", name="Look at it and clear").click()
+        await page.get_by_role("button", name="Look at it and reset").click()
         for view in VIEWS:
             await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
             await page.wait_for_timeout(200)
@@ -120,7 +120,7 @@ async def test_a_fault_appears_and_is_cleared_only_after_it_was_shown(night):
         alert = page.get_by_role("alert")
         assert "71.2" in await alert.inner_text()
         assert not await page.get_by_role("button", name="The cause is removed").is_visible()
-        await page.get_by_role("button", name="Look at it and clear").click()
+        await page.get_by_role("button", name="Look at it and reset").click()
         await page.get_by_text("Readings now").wait_for()
         said = await alert.inner_text()
         assert "°C" in said
@@ -129,7 +129,7 @@ async def test_a_fault_appears_and_is_cleared_only_after_it_was_shown(night):
         await page.get_by_role("button", name="The cause is removed").click()
         await page.locator("#phase", has_text="Running").wait_for()
         await alert.wait_for(state="detached")
-        assert [verb for _, verb, _ in night.orders] == ["clear"]
+        assert [verb for _, verb, _ in night.orders] == ["reset"]
 
 
 async def test_a_prompt_is_answered(night):
@@ -262,10 +262,10 @@ async def test_a_run_that_has_tripped_is_resumed_once_that_is_cleared(night):
     ]
     night.trip()
     async with a_page(night.chromium, night.port, "queue") as page:
-        await page.get_by_text("clear it, above; then a run can be resumed").wait_for()
+        await page.get_by_text("reset it, above; then a run can be resumed").wait_for()
         resume = page.get_by_role("button", name="Resume: run 5")
         assert await resume.is_disabled()
-        await page.get_by_role("button", name="Look at it and clear").click()
+        await page.get_by_role("button", name="Look at it and reset").click()
         await page.get_by_role("button", name="The cause is removed").click()
         await resume.click()  # waits until it may
         await page.get_by_text("a run has the stand").wait_for()  # what this desk answers
@@ -311,7 +311,7 @@ async def test_who_may_only_look_is_told_so_and_orders_nothing_but_stop(night):
         await page.reload()
         await page.get_by_text("The token of wall may look and press STOP").wait_for()
         night.trip()
-        await page.get_by_role("button", name="Look at it and clear").click()
+        await page.get_by_role("button", name="Look at it and reset").click()
         for view in VIEWS:
             await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
             await page.wait_for_timeout(200)

@@ -216,7 +216,7 @@ def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
         with pytest.raises(StandTripped, match=r"halted: run 1: air is too warm"):
             queue.take(tmp_path, 4)
         assert states(tmp_path) == [(1, "failed"), (2, "waiting")]
-        queue.clear(tmp_path)
+        queue.reset(tmp_path)
         assert queue.take(tmp_path, 4) is not None
 
 

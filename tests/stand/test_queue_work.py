@@ -104,7 +104,7 @@ async def test_a_trip_halts_the_queue_until_an_operator_clears_it(tmp_path: Path
     assert [entry[0] for entry in runs.entries()] == ["failed", "waiting"]
     with pytest.raises(StandTripped, match="halted: run 1: "):
         await runs.work()
-    queue.clear(tmp_path)
+    queue.reset(tmp_path)
     await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["failed", "done"]
 
@@ -117,7 +117,7 @@ async def test_a_run_that_an_operator_ends_is_stopped_and_not_failed(tmp_path: P
     assert [entry[0] for entry in runs.entries()] == ["stopped", "stopped", "waiting"]
     assert runs.entries()[0][2] == "stopped by the operator"
     assert queue.queued(tmp_path).halted == "run 2: again"
-    queue.clear(tmp_path)
+    queue.reset(tmp_path)
     await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["stopped", "stopped", "done"]
 

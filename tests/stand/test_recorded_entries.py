@@ -21,10 +21,10 @@ from thermostand.stand.gate import INTERLOCK, OPERATOR, STOPPING
 from thermostand.stand.running.memory.entries import (
     Again,
     Begun,
-    Cleared,
     Ended,
     Entry,
     Held,
+    Reset,
     Skipped,
     StepChanged,
     Taken,
@@ -99,7 +99,7 @@ async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp
     logbook, journal = Logbook(hub, clock, fold(PLAN, [])), Journal.create(tmp_path)
     logbook.tripped(Fault("early", "before the run"))
     assert logbook.state.tripped == "before the run"
-    logbook.enter(Cleared(5))
+    logbook.enter(Reset(5))
     await logbook.begin(journal, BEGUN)
     for reason, held in ((OPERATOR, True), (STOPPING, True), (INTERLOCK, True), (OPERATOR, False), (INTERLOCK, False)):
         logbook.held(reason, held)
@@ -117,7 +117,7 @@ async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp
         Held(5, OPERATOR, True),
         Held(5, INTERLOCK, True),
         Held(5, OPERATOR, False),
-        Cleared(5),
+        Reset(5),
         Held(5, INTERLOCK, False),
         Tripped(5, "air_hot", "too hot"),
     ]

@@ -47,7 +47,6 @@ from thermostand.stand.running.executing.actions import (
 )
 from thermostand.stand.running.memory.entries import (
     Again,
-    Cleared,
     Cooled,
     Due,
     Dwell,
@@ -58,6 +57,7 @@ from thermostand.stand.running.memory.entries import (
     Gap,
     Held,
     Readying,
+    Reset,
     Restored,
     Skipped,
     StepChanged,
@@ -149,7 +149,7 @@ EVENTS = {
     "ready": ([*held_for(0, 70), Readying(70 * S, True)], {"now_ns": 80 * S}),
     "held 70 s": (held_for(0, 70), {"now_ns": 80 * S}),
     "interlock": ([Held(10 * S, INTERLOCK, True)], {"held": True}),
-    "cleared": (held_for(10, 15, INTERLOCK), {"flap_open": False}),
+    "reset": (held_for(10, 15, INTERLOCK), {"flap_open": False}),
     "restored": ([*held_for(10, 15, INTERLOCK), Restored(16 * S, 1)], {"flap_open": False}),
     "camera off": ([Cooled(10 * S)], {"lost_equilibrium": True}),
     "camera back": ([Cooled(10 * S), Restored(15 * S, 1)], {"lost_equilibrium": True}),
@@ -405,7 +405,7 @@ def test_a_trip_stays_until_it_is_cleared_and_an_end_until_the_run_goes_on():
     state = fold(PLAN, [Tripped(0, "a", "first"), Tripped(0, "b", "second"), Ended(1, "tripped", "aborted")])
     assert (state.tripped, state.ended.status) == ("first", "tripped")
     assert after(state, Gap(1, 2)).ended is None
-    assert after(state, Cleared(2)).tripped == ""
+    assert after(state, Reset(2)).tripped == ""
 
 
 def test_a_soak_longer_than_its_time_and_one_that_was_lost_owe_what_they_say():

@@ -30,7 +30,7 @@ def test_what_was_kept_is_found_by_another_program_until_it_is_cleared(path: Pat
     assert (found.rule, found.text, found.since_ns) == (FAULT.rule, FAULT.text, 5)
     assert LatchFile([path]).forget() == ""
     assert LatchFile([path]).read() is None
-    LatchFile([path]).clear()
+    LatchFile([path]).reset()
 
 
 def whole(path: Path) -> bytes:
@@ -82,7 +82,7 @@ def test_one_that_cannot_be_read_counts_as_latched_and_can_be_cleared(path: Path
     assert found is not None
     assert found.rule == UNREADABLE
     assert str(path) in found.text
-    LatchFile([path]).clear()
+    LatchFile([path]).reset()
     assert LatchFile([path]).read() is None
 
 
@@ -90,7 +90,7 @@ def test_one_that_cannot_be_cleared_stays_and_is_named(path: Path):
     path.mkdir(parents=True)
     (path / "something").touch()
     with pytest.raises(SessionError, match="the stand stays latched"):
-        LatchFile([path]).clear()
+        LatchFile([path]).reset()
 
 
 def test_a_disk_that_hangs_keeps_the_guard_waiting_for_a_moment_only(path: Path):

@@ -76,9 +76,9 @@ class Surfaces:
         self.guard.look()
         self.objection = None
 
-    async def clear(self) -> None:
+    async def reset(self) -> None:
         """An operator does."""
-        await asyncio.to_thread(server_of(self.session).order, "clear")
+        await asyncio.to_thread(server_of(self.session).order, "reset")
 
     async def rules(self) -> set[str]:
         """Which rule has tripped, by the answers of all surfaces."""
@@ -203,13 +203,13 @@ def a_folder_that_is_none(config_file: Path) -> None:
     state_folder().write_text("")
 
 
-def cleared(config_file: Path) -> None:
+def reset(config_file: Path) -> None:
     tripped(config_file)
-    latch_file(load_config(config_file)).clear()
+    latch_file(load_config(config_file)).reset()
 
 
 def cleared_and_tripped_again(config_file: Path) -> None:
-    cleared(config_file)
+    reset(config_file)
     tripped(config_file)
 
 
@@ -225,7 +225,7 @@ def cleared_and_tripped_again(config_file: Path) -> None:
         (of_another_stand, NOTHING),
         (without_its_folder, NOTHING),
         (a_folder_that_is_none, UNREADABLE),
-        (cleared, NOTHING),
+        (reset, NOTHING),
         (cleared_and_tripped_again, FAULT.rule),
     ],
 )
@@ -254,7 +254,7 @@ async def test_every_surface_follows_a_trip_its_clearing_and_the_next_trip(confi
             assert await surfaces.rules() == {FAULT.rule}
             async with started(config_file, tmp_path / "again") as restarted:  # as if it had been killed now
                 assert await restarted.rules() == {FAULT.rule}
-            await surfaces.clear()
+            await surfaces.reset()
             assert await surfaces.rules() == {NOTHING}
             assert whole() == []
         surfaces.guard.latch.trip(replace(FAULT, ends_itself=True))

@@ -103,9 +103,9 @@ async def test_each_warning_says_what_to_type(tmp_path: Path):
     ("kind", "data", "command"),
     [
         ("held", {"reason": "interlock"}, "`stand status`"),  # some rules end by themselves
-        ("guard.stuck", {"action": "hold"}, "`stand clear`"),
-        ("guard.stuck", {"action": "abort"}, "`stand resume DIR --clear`"),
-        ("guard.stuck", {"action": "abort"}, "`stand clear` where a daemon has the stand"),
+        ("guard.stuck", {"action": "hold"}, "`stand reset`"),
+        ("guard.stuck", {"action": "abort"}, "`stand resume DIR --reset`"),
+        ("guard.stuck", {"action": "abort"}, "`stand reset` where a daemon has the stand"),
         ("guard.not_recorded", {"action": "hold", "ends_itself": True}, "by itself"),
         ("prompt", {}, "`stand continue`"),
         ("disk_nearly_full", {}, "`stand session archive`"),

@@ -47,7 +47,7 @@ FAST: dict[str, dict[str, object]] = {
     "flap": {"poll_s": 0.5},
     "camera": {"poll_s": 0.5, "boot_s": 0.2},
     "guard": {"period_s": 0.25, "stale_after_s": 15.0, "heater_hold_s": 3.0, "heater_renew_s": 0.5},
-    # Longer than a commit takes on the busy disk of a shared machine: the fourth hold within an hour waits for `clear`.
+    # Longer than a commit takes on the busy disk of a shared machine: the fourth hold within an hour waits for `reset`.
     "recording": {"telemetry_commit_s": 0.2, "durable_within_s": 3.0},
 }
 

@@ -1,4 +1,4 @@
-"""Autotuning that somebody starts at the regulator: held like manual mode, and the night goes on after `clear`."""
+"""Autotuning that somebody starts at the regulator: held like manual mode, and the night goes on after `reset`."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -49,7 +49,7 @@ async def test_autotuning_is_held_and_the_run_goes_on_after_clear(
         await watcher.wait(60)
         status = await asyncio.to_thread(ask_status, directory)
         assert (status.state, status.reasons) == ("held", ("interlock",))
-        await asyncio.to_thread(ask, directory, "clear")
+        await asyncio.to_thread(ask, directory, "reset")
         await watcher.event("restored", 60)
 
     session = Session.open(await operated(run_virtual(ordered, out, None, watch), operate()))

@@ -169,7 +169,7 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_again_from_a_cold_cam
     async def operator(reason: str) -> None:
         await fault(ordered, "axis.alarm", None)
         (directory,) = out.iterdir()
-        await asyncio.to_thread(ask, directory, "clear")
+        await asyncio.to_thread(ask, directory, "reset")
 
     act, tasks, items = acting({3: lambda: fault(ordered, "axis.alarm", "rotary")}, operator)
 

@@ -291,13 +291,13 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(
     assert latched.fault is not None
     assert latched.counters["relay_cycles.heater_enable"] >= 1  # of the daemon before
     assert latched.fault.rule == tripped.fault.rule
-    again.post("run/clear")
+    again.post("run/reset")
     again.until(lambda state: state.fault is None and states_of(state) == ["done"])
 
 
 @pytest.mark.parametrize("kills", [2, by_night(20)])
 def test_a_trip_that_somebody_has_heard_of_is_never_forgotten(laboratory: Path, tmp_path: Path, kills: int):
-    """Killed as soon as the stand's state says it; what is left is cleared without a daemon."""
+    """Killed as soon as the stand's state says it; what is left is reset without a daemon."""
     for kill in range(kills):
         served = Served(laboratory, tmp_path / f"out-{kill}")
         try:
@@ -308,10 +308,10 @@ def test_a_trip_that_somebody_has_heard_of_is_never_forgotten(laboratory: Path, 
         finally:
             served.process.send_signal(signal.SIGKILL)
             served.process.communicate()
-        clear = [sys.executable, "-m", "thermostand.stand.cli", "clear", "--config", str(laboratory)]
-        cleared = forked.popen(clear, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        assert "cleared: the folder" in cleared.communicate()[0]
-        assert cleared.returncode == 0
+        command = [sys.executable, "-m", "thermostand.stand.cli", "reset", "--config", str(laboratory)]
+        process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        assert "reset: the folder" in process.communicate()[0]
+        assert process.returncode == 0
 
 
 def test_a_second_daemon_and_a_second_run_touch_nothing(serve: Callable[[], Served], laboratory: Path, tmp_path: Path):
@@ -371,7 +371,7 @@ def test_stand_run_goes_through_the_daemon_that_has_the_stand(serve: Callable[[]
     assert "the stand is safe" in err
     halted = served.until(lambda state: is_idle(state) and states_of(state) == ["done", "stopped", "waiting"])
     assert halted.queue_halted  # who presses stop does not want the next one to begin
-    served.post("run/clear")
+    served.post("run/reset")
     served.until(lambda state: states_of(state) == ["done", "stopped", "done"])
 
 

@@ -109,13 +109,13 @@ async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path
     last = next(number for number, entry in enumerate(entries) if isinstance(entry, Tripped))
     copy = Path(shutil.copytree(directory, tmp_path / "copy"))
     (copy / JOURNAL_NAME).write_bytes(b"".join(lines[:last]))  # as a disk that has lost its last flushes
-    with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --clear"):
+    with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --reset"):
         await asyncio.to_thread(interruption, copy)
     flip(directory, -1, *(number for number, entry in enumerate(entries) if isinstance(entry, Tripped)))
     assert (verify(directory).run, verify(directory).files) == (RunOutcome.TRIPPED, Files.DAMAGED)
     for _ in range(2):  # also when the last line has been cut off
-        with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --clear"):
+        with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --reset"):
             await asyncio.to_thread(interruption, directory)
-    before = await asyncio.to_thread(partial(interruption, directory, clear=True))
+    before = await asyncio.to_thread(partial(interruption, directory, reset=True))
     assert before.state.tripped
     before.release()

@@ -368,7 +368,7 @@ def journalled(stand, name, directory, hit):
         return
     before.release()
     if name == TRIPPED:
-        yield "a run that has tripped is resumed without --clear"
+        yield "a run that has tripped is resumed without --reset"
 
 
 def judge(stand, chosen):

@@ -89,9 +89,7 @@ def telling(order: Order, path: Path) -> Order:
 def trips_of(directory: Path) -> list[str]:
     entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
     return [
-        entry.rule if isinstance(entry, Tripped) else "cleared"
-        for entry in entries
-        if isinstance(entry, Tripped | Cleared)
+        entry.rule if isinstance(entry, Tripped) else "reset" for entry in entries if isinstance(entry, Tripped | Reset)
     ]
 
 
@@ -151,7 +149,7 @@ async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_opera
         check_safe(session)
     supply = session.readings("relays.camera_power")[1][-1]
     assert supply == (0 if name == "camera.sensor_degC" else 1)  # one that is too warm itself is switched off
-    with pytest.raises(SessionError, match=r"tripped: .*resume with --clear"):
+    with pytest.raises(SessionError, match=r"tripped: .*resume with --reset"):
         interruption(directory)
 
 
@@ -190,7 +188,7 @@ BY_DAY = {"set point by hand", "lost writes"}
 async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
     tmp_path: Path, order: Callable[..., Order], name: str
 ):
-    """It holds, stays held when its cause is gone, and is cleared over the socket."""
+    """It holds, stays held when its cause is gone, and is reset over the socket."""
     rule, breaks, mends = TO_BE_PUT_RIGHT[name]
     out, watcher = tmp_path / "out", Watcher()
     ordered = order(LONG_SOAK)
@@ -210,17 +208,17 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
         await do(*breaks)
         trip = await watcher.event(f"guard.{rule}", 3000)
         assert trip.level == "error"
-        if rule == "stage_alarm":  # cleared without a look at the cause
-            cleared = await asyncio.to_thread(ask, directory, "clear")
-            assert cleared["reasons"] == ["interlock"]
-            assert trip.text in str(cleared["text"])
+        if rule == "stage_alarm":  # reset without a look at the cause
+            reset = await asyncio.to_thread(ask, directory, "reset")
+            assert reset["reasons"] == ["interlock"]
+            assert trip.text in str(reset["text"])
             await watcher.event("guard.stage_alarm", 60)
         if mends:
             await do(*mends)
         await watcher.wait(300)
         status = await asyncio.to_thread(ask_status, directory)
         assert (status.state, status.reasons) == ("held", ("interlock",))
-        assert (await asyncio.to_thread(ask, directory, "clear"))["reasons"] == []
+        assert (await asyncio.to_thread(ask, directory, "reset"))["reasons"] == []
         await watcher.event("restored", 60)
         await asyncio.to_thread(ask, directory, "stop")
 
@@ -246,7 +244,7 @@ async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_ro
         await watcher.event("guard.disk_low", 1200)
         (directory,) = out.iterdir()
         assert (await asyncio.to_thread(ask_status, directory)).reasons == ("disk_low", "interlock")
-        assert (await asyncio.to_thread(ask, directory, "clear"))["reasons"] == ["disk_low"]
+        assert (await asyncio.to_thread(ask, directory, "reset"))["reasons"] == ["disk_low"]
         await watcher.event("guard.disk_low", 1200)
         await asyncio.to_thread(ask, directory, "stop")
 

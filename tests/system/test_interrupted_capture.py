@@ -179,7 +179,7 @@ async def test_a_disk_that_refuses_some_frames_costs_neither_the_run_nor_a_frame
 async def test_a_disk_that_refuses_for_long_costs_neither_the_run_nor_a_frame(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    """Longer than the guard lets the flap be open: nobody has to clear anything."""
+    """Longer than the guard lets the flap be open: nobody has to reset anything."""
     ordered, out = order(RECIPE, guard={"flap_capture_s": 150.0}), tmp_path / "out"
     interrupter = Interrupter(disk(4096), disk(None), 300.0)
     session = await interrupted(ordered, out, interrupter)

@@ -37,7 +37,7 @@ async def press(out: Path, run: asyncio.Task[Path], seed: int, news: asyncio.Eve
         waiting.cancel()
         news.clear()
         for directory in out.glob("*/"):
-            for do in (rng.choice(["pause", "pause", "clear", "status"]), "status", "continue"):
+            for do in (rng.choice(["pause", "pause", "reset", "status"]), "status", "continue"):
                 try:
                     answers.append(await asyncio.to_thread(pressed, directory, do))
                 except SessionError as error:
@@ -63,7 +63,7 @@ async def test_a_night_with_two_restless_operators_is_whole(tmp_path: Path, orde
     assert [entry.held for entry in held] == [True, False] * (len(held) // 2)
     assert all(entry.reason == "operator" for entry in held)
     refused = {answer for answers_ in answers for answer in answers_ if isinstance(answer, str)}
-    assert any("nothing to clear" in text for text in refused)
+    assert any("nothing to reset" in text for text in refused)
     assert all(text.count("\n") == 0 for text in refused)
 
 

@@ -66,7 +66,7 @@ async def test_a_pause_that_lasts_too_long_is_made_safe_and_held(tmp_path: Path,
         assert trip.data == {"rule": "paused_too_long", "action": "hold", "ends_itself": False}
         await watcher.wait(60)
         reasons.append((await asyncio.to_thread(ask, directory, "continue"))["reasons"])
-        reasons.append((await asyncio.to_thread(ask, directory, "clear"))["reasons"])
+        reasons.append((await asyncio.to_thread(ask, directory, "reset"))["reasons"])
         await watcher.event("restored", 60)
         await asyncio.to_thread(ask, directory, "stop")
 

@@ -180,9 +180,9 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
 
     with pytest.raises(StandTripped, match=r"thermometers\.air is BAD"):
         await resume(findable(interruption(directory)), start(lambda: fault(ordered, "thermometer.open", "air")))
-    with pytest.raises(SessionError, match=r"tripped: thermometers\.air is BAD.*resume with --clear"):
+    with pytest.raises(SessionError, match=r"tripped: thermometers\.air is BAD.*resume with --reset"):
         interruption(directory)
-    assert await resume(interruption(directory, clear=True), lambda hub: None) == directory
+    assert await resume(interruption(directory, reset=True), lambda hub: None) == directory
     await asyncio.gather(*tasks)
     session = check(directory, ordered, [])
     check_soaks(directory, ordered)

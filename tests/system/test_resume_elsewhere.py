@@ -73,7 +73,7 @@ def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_sai
     assert "touch" in before.order.config_text  # what is recorded stays as it was
     with pytest.raises(StandTripped, match=r"thermometers\.air is BAD"):
         asyncio.run(resume(before, at_step("soak", broken)))
-    resumed = CliRunner().invoke(app, ["resume", str(directory), "--clear"])
+    resumed = CliRunner().invoke(app, ["resume", str(directory), "--reset"])
     assert resumed.exit_code == 0, resumed.output
     said = [line for line in resumed.stderr.splitlines() if "as on this stand" in line]
     assert len(said) == 2

@@ -155,7 +155,7 @@ async def test_a_run_leaves_nothing_behind_however_it_ends(tmp_path: Path, order
         await run_virtual(ordered, tmp_path / "stopped", None, stop)
     assert not left_since(before)
     broken = at_step("soak", lambda: break_now(ordered, "flap.jam", 500))
-    with pytest.raises(NotCleared):
+    with pytest.raises(NotReset):
         await run_virtual(ordered, tmp_path / "failed", None, broken)
     assert not left_since(before)
 

@@ -64,7 +64,7 @@ def begin(tmp_path: Path, laboratory: Path) -> Iterator[Callable[[], Served]]:
 
 @pytest.mark.usefixtures("own_helpers")
 def test_whichever_disk_process_is_killed_no_heat_goes_on_without_what_it_did(begin: Callable[[], Served]):
-    """That of the record between runs is replaced, and an operator may clear and heat again. Without its own the daemon
+    """That of the record between runs is replaced, and an operator may reset and heat again. Without its own the daemon
     knows neither its queue nor keeps the compressor's rest: it ends, and the next one has both."""
     served = begin()
     served.until(is_idle)
@@ -75,7 +75,7 @@ def test_whichever_disk_process_is_killed_no_heat_goes_on_without_what_it_did(be
     served.until(lambda state: state.fault is not None and state.readings["relays.heater_enable"].value == 0)
     served.until(lambda _: len(set(disk_processes(served)) - {of_record}) == 2)
     served.until(lambda state: state.disk_free_bytes > 0)  # there is a record again
-    served.post("run/clear")
+    served.post("run/reset")
     assert served.state().fault is None
     served.post("devices/regulator/set", arguments={"setpoint_degC": 40.0})
     served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
@@ -141,7 +141,7 @@ def test_a_hung_disk_holds_the_stand_over_a_stop_of_the_process_and_keeps_nobody
 
 @pytest.mark.usefixtures("own_helpers")
 def test_a_served_run_whose_disk_process_is_killed_is_resumed_by_itself_and_by_an_operator(served: Served):
-    """By itself three times in an hour; then it is an operator's, who clears and resumes: what was written is repaired
+    """By itself three times in an hour; then it is an operator's, who resets and resumes: what was written is repaired
     first, though no segment of it was ever finished."""
     served.until(is_idle)
     served.submit(SOAK)
@@ -157,7 +157,7 @@ def test_a_served_run_whose_disk_process_is_killed_is_resumed_by_itself_and_by_a
             served.until(lambda state: state.run is not None and state.fault is None)
     ended = served.until(lambda state: state.phase == "idle" and [run.state for run in state.queue] == ["failed"])
     assert ended.fault is not None
-    served.post("run/clear")
+    served.post("run/reset")
     served.post(f"sessions/{ended.queue[0].session}/resume")
     served.until(is_heating)
     served.post("run/stop")

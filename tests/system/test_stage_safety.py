@@ -199,7 +199,7 @@ async def test_a_trip_while_homed_is_answered_lets_no_move_of_the_plan_begin(ben
     assert bench.tap.count("move") == before
     with pytest.raises(Superseded):  # a program that does not ask the stand
         await axis.move_to(5.0)
-    stand.latch.clear()
+    stand.latch.reset()
     move = asyncio.create_task(stand.table.move_to("linear", 25.0))
     while bench.tap.count("move") == before:
         await asyncio.sleep(0.01)

@@ -1,5 +1,5 @@
 """A device error that a step meets first is the guard's hold, as one that its rule finds: the run goes on where the
-rule's hold ends, else by `clear`, and what still stands holds again. Over every wire, in virtual time."""
+rule's hold ends, else by `reset`, and what still stands holds again. Over every wire, in virtual time."""
 
 import asyncio
 from collections.abc import Callable
@@ -48,7 +48,7 @@ steps:
 
 @dataclass
 class Operator:
-    """Clears a hold that does not end by itself so many s after it began, at most `most` times, and notes each hold as
+    """Resets a hold that does not end by itself so many s after it began, at most `most` times, and notes each hold as
     (rule, whether it ends itself)."""
 
     after_s: float
@@ -73,7 +73,7 @@ class Operator:
                 self._due_ns = item.time_ns + seconds_ns(self.after_s)
         if isinstance(item, Batch) and self._due_ns is not None and item.time_ns >= self._due_ns:
             self._due_ns = None
-            self._asking.append(asyncio.create_task(asyncio.to_thread(ask, self.directory, "clear")))
+            self._asking.append(asyncio.create_task(asyncio.to_thread(ask, self.directory, "reset")))
 
 
 async def run_with(order: Order, out: Path, operator: Operator) -> Session:
@@ -158,7 +158,7 @@ def test_a_virtual_run_that_nobody_clears_ends_safe_with_its_own_status_and_is_r
     assert 1800.0 <= (end.time_ns - trip.time_ns) / NS_PER_S <= 1860.0
     assert end.data["status"] == "tripped"
     again = ["resume", str(directory), "--config", str(config)]
-    assert CliRunner().invoke(app, again).exit_code == FAILED  # nobody has cleared it
+    assert CliRunner().invoke(app, again).exit_code == FAILED  # nobody has reset it
     # Its laboratory is a new one, and the plan is done before the fault comes in that.
-    assert CliRunner().invoke(app, [*again, "--clear"]).exit_code == 0
+    assert CliRunner().invoke(app, [*again, "--reset"]).exit_code == 0
     assert Session.open(directory).frame_count == 6

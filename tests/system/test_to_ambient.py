@@ -147,25 +147,25 @@ async def test_a_trip_on_the_way_back_ends_it_and_it_goes_on_when_that_is_cleare
         await run_virtual(order, tmp_path / "out", None, on_the_way(broken))
     (directory,) = (tmp_path / "out").glob("*-away")
     check_ended(directory, "aborted")
-    with pytest.raises(SessionError, match="resume with --clear"):
+    with pytest.raises(SessionError, match="resume with --reset"):
         interruption(directory)
-    await resume(interruption(directory, clear=True), lambda hub: None)
+    await resume(interruption(directory, reset=True), lambda hub: None)
     assert "at_ambient" in check_ended(directory, "aborted", "complete")
 
 
 async def test_a_hold_on_the_way_back_stops_the_chamber_which_goes_on_after_it(tmp_path: Path):
-    """Somebody stops the regulator with its keys, and an operator clears that."""
+    """Somebody stops the regulator with its keys, and an operator resets that."""
     order, works, seen = replace(far(tmp_path), at_configured_addresses=True), list[asyncio.Task[Any]](), list[Event]()
 
-    async def clear() -> None:
+    async def reset() -> None:
         (directory,) = (tmp_path / "out").glob("*-away")
-        await asyncio.to_thread(ask, directory, "clear")
+        await asyncio.to_thread(ask, directory, "reset")
 
     def follow(item: Item) -> None:
         if isinstance(item, Event):
             seen.append(item)
             if item.kind == "held":
-                works.append(asyncio.create_task(clear()))
+                works.append(asyncio.create_task(reset()))
 
     def watch(hub: Hub) -> None:
         hub.subscribe(follow)

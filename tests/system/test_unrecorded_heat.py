@@ -188,7 +188,7 @@ async def test_a_folder_that_is_taken_away_holds_the_run_until_an_operator_clear
         await happens(watcher, "guard.folder_lost")
         await heater_is(ordered, 0)
         assert (await asyncio.to_thread(ask_status, directory)).state == "held"
-        await asyncio.to_thread(ask, directory, "clear")
+        await asyncio.to_thread(ask, directory, "reset")
         await happens(watcher, "restored")
         await heater_is(ordered, 1)
         await asyncio.to_thread(ask, directory, "stop")

@@ -143,15 +143,15 @@ BEYOND = ("relays.welded", "relays.no_timer", "relays.no_rearm", "relays.lost_wr
 _TIMES_OUT = ("silent", "unplugged", "mute", "silent_s", "swallows_first", "compoway", "hangs_up")
 _NAMES = {"5": ("air", "granite_inside", "granite_outside", "artifact", "laboratory"), "2": ("air", "granite_inside")}
 ORDERS = (
-    *("pause", "continue", "clear", "stop", "note", "skip", "extend", "interrupt", "state"),
+    *("pause", "continue", "reset", "stop", "note", "skip", "extend", "interrupt", "state"),
     *("switch_on", "switch_off", "lose_folder", "fill_disk", "refuse_writes"),
 )
 """The operator's commands over HTTP, two signals, a second client's look, a second master that writes coils, and what
 happens to the disk of the session."""
 UNDONE = {
     "pause": ("continue",),
-    "lose_folder": ("find_folder", "clear"),
-    "fill_disk": ("empty_disk", "clear"),
+    "lose_folder": ("find_folder", "reset"),
+    "fill_disk": ("empty_disk", "reset"),
     "refuse_writes": ("take_writes",),
 }
 """What follows on an order, some time later."""

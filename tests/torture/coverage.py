@@ -16,7 +16,7 @@ from thermostand.stand.running.memory.entries import Written
 
 SITUATIONS = ("between", "soak", "capture", "step", "held", "tripped", "ended")
 """Of a run, as its journal shows them: what is under way, or why nothing is."""
-_AT_AN_END, _OF_A_TRIP = {"Gap", "Cleared", "Tripped"}, {"Cleared"}
+_AT_AN_END, _OF_A_TRIP = {"Gap", "Reset", "Tripped"}, {"Reset"}
 
 
 class Reached:
@@ -78,7 +78,7 @@ def rows_of(journal: Sequence[Mapping[str, Any]], steps: Mapping[str, str]) -> I
                 under_way = ""
             case "Held":
                 held = held | {entry["reason"]} if entry["held"] else held - {entry["reason"]}
-            case "Tripped" | "Cleared":
+            case "Tripped" | "Reset":
                 tripped = name == "Tripped"
             case "Ended" | "Gap":
                 under_way, held, ended = "", set[str](), name == "Ended"

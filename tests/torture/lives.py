@@ -52,7 +52,7 @@ def live(case: Case, folder: Path) -> list[Life]:
         find_folder(folder)
         sessions = sorted(path.parent for path in out.glob("*/journal.jsonl") if path.stat().st_size)
         if sessions:
-            command = ["resume", str(sessions[0]), *config, *(["--clear"] if lives[-1].status != KILLED else [])]
+            command = ["resume", str(sessions[0]), *config, *(["--reset"] if lives[-1].status != KILLED else [])]
         else:
             shutil.rmtree(out, ignore_errors=True)
             command = ["run", str(folder / "plan.yaml"), *config, "--out", str(out), "--virtual-time"]

@@ -63,7 +63,7 @@ from thermostand.stand.simulator import laboratory_of
 BUSY_S = 40.0  # in which things break
 AFTER_S = 7.0
 LIMIT_S, LEAVES_S = 240.0, 60.0  # until the plan is complete, all else mended; until a daemon has left
-LOOK_S, AGAIN_S, CLEARS_EACH_S = 0.5, 1.0, 5.0  # of the operator; until the daemon is started again; between two clears
+LOOK_S, AGAIN_S, RESETS_EACH_S = 0.5, 1.0, 5.0  # of the operator; until the daemon is started again; between two resets
 MOST_ORDERS, MOST_KILLS = 6, 2
 PRESSED_S = 10.0  # after which a STOP is given up
 DISK_BYTES = 6 << 30
@@ -253,7 +253,7 @@ def _given(bench: Bench, order: Order) -> Iterator[None]:
     yield
 
 
-for _verb in ("clear", "skip", "extend", "note", "switch_on", "switch_off"):
+for _verb in ("reset", "skip", "extend", "note", "switch_on", "switch_off"):
     KINDS[_verb] = Kind(contextmanager(_given), (0.0,), ())
 
 
@@ -494,7 +494,7 @@ class Bench:
         return Life([], status, "", self._said.read_text(errors="replace"), *times_ns)
 
     def _operate(self) -> None:
-        """As an operator who wants the plan done: submit it, clear what holds it, resume it."""
+        """As an operator who wants the plan done: submit it, reset what holds it, resume it."""
         state = self.doors.asked("GET", "state")
         if isinstance(state, dict) and "queue" in state and not self._opened_ns:
             self._opened_ns = self.clock.now_ns()
@@ -509,10 +509,10 @@ class Bench:
             text = (self._folder / "plan.yaml").read_text()
             self.doors.asked("POST", "queue", {"recipe_text": text, "key": f"torture-{len(state['queue'])}"})
         elif state["fault"] or state["queue_halted"]:
-            # Who clears has looked: not while the folder is away, and not twice a second while a fault lasts.
+            # Who resets has looked: not while the folder is away, and not twice a second while a fault lasts.
             if time.monotonic() >= self._clears_s and not any((self.disk / HIDDEN).iterdir()):
-                self._clears_s = time.monotonic() + CLEARS_EACH_S
-                self.doors.asked("POST", "run/clear", {})
+                self._clears_s = time.monotonic() + RESETS_EACH_S
+                self.doors.asked("POST", "run/reset", {})
         elif last["state"] in ("failed", "stopped", "interrupted"):
             self.doors.asked("POST", f"sessions/{last['session']}/resume", {})
         elif self._is_quiet and state["phase"] == "held":

@@ -204,7 +204,7 @@ def test_a_broken_case_is_shrunk_to_what_breaks_it(
         "relays.silent",
     )
     faults = tuple(Fault(name, True, 5.0, 1800.0) for name in names)
-    orders = tuple(Order(verb, 3.0) for verb in ("pause", "continue", "stop", "clear", "note", "state"))
+    orders = tuple(Order(verb, 3.0) for verb in ("pause", "continue", "stop", "reset", "note", "state"))
     case = replace(draw(3), faults=faults, orders=orders, kills_s=(9.0, 11.0, 12.0), attended=True)
     case = replace(case, stand={**case.stand, "cameras": "2 cameras", "heat": "cts"})
     monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter(), [], {}))

@@ -76,7 +76,7 @@ class Soaking:
             text = f"{self._text(step)} at the end of the longest soak"
             if isinstance(step, Soak) and step.unsettled == "hold":
                 await self._log.write(Dwell(now_ns, step_id, 0.0))
-                raise DeviceFault("regulator", f"{text}; once cleared, it begins anew")
+                raise DeviceFault("regulator", f"{text}; once that is reset, the soak begins again")
             self._log.tell(SOAK_UNSETTLED, text, step_id=step_id)
         ended = "" if not is_over else "settled" if is_settled else "unsettled"
         await self._log.write(Dwell(now_ns, step_id, earned_ns / NS_PER_S, ended))

@@ -133,7 +133,7 @@ class Edited:
 
 @dataclass(frozen=True, slots=True)
 class Tripped:
-    """The guard has made the stand safe; nothing is done before an operator has cleared it."""
+    """The guard has made the stand safe; nothing is done before an operator has reset it."""
 
     time_ns: int
     rule: str
@@ -141,7 +141,7 @@ class Tripped:
 
 
 @dataclass(frozen=True, slots=True)
-class Cleared:
+class Reset:
     """An operator has removed the cause of a trip."""
 
     time_ns: int

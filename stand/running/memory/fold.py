@@ -25,7 +25,6 @@ from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.running.memory.entries import (
     Again,
     Change,
-    Cleared,
     Cooled,
     Due,
     Dwell,
@@ -36,6 +35,7 @@ from thermostand.stand.running.memory.entries import (
     Gap,
     Held,
     Readying,
+    Reset,
     Restored,
     Skipped,
     StepChanged,
@@ -85,7 +85,7 @@ def after(state: RunState, entry: Entry) -> RunState:
             return state if refusal(state, entry) else _changed(state, entry)
         case Tripped(_, _, text):
             return replace(state, tripped=state.tripped or text)
-        case Cleared():
+        case Reset():
             return replace(state, tripped="")
         case Ended():
             return replace(state, ended=entry)

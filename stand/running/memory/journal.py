@@ -37,7 +37,7 @@ from thermostand.recording.writing.homes import FolderLost
 from thermostand.recording.writing.locks import lock
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import HELD, IN_WORDS, INTERLOCK, RELEASED, STOPPING
-from thermostand.stand.running.memory.entries import Cleared, Ended, Entry, Held, Tripped, Written, decoded, encoded
+from thermostand.stand.running.memory.entries import Ended, Entry, Held, Reset, Tripped, Written, decoded, encoded
 from thermostand.stand.running.memory.fold import after
 from thermostand.stand.running.memory.state import RunState
 
@@ -50,7 +50,7 @@ class Journal:
     """The journal of one session, locked (flock) while it is open: one daemon per session.
 
     Lines that the disk refuses are kept and written with the next one; `trouble` is called when that begins. All lines
-    are kept in memory: a journal that was removed under its run is rewritten when an operator has cleared that.
+    are kept in memory: a journal that was removed under its run is rewritten when an operator has reset that.
     """
 
     def __init__(self, path: Path, fd: int, data: bytes, mark: bytes, damage: str = "") -> None:
@@ -383,7 +383,7 @@ class Logbook:
         self.tell(HELD if held else RELEASED, IN_WORDS.get(reason, reason), reason=reason)
         now_ns = self._clock.now_ns()
         if reason == INTERLOCK and not held:
-            self._note(Cleared(now_ns))
+            self._note(Reset(now_ns))
         self._note(Held(now_ns, reason, held))
 
     def _note(self, entry: Written) -> None:

@@ -7,7 +7,7 @@ cold, and no equilibrium). And in virtual time, where no operator is there, a ho
 from __future__ import annotations
 
 from thermostand.foundation.clock import Clock, seconds_ns
-from thermostand.foundation.errors import DeviceError, NotCleared, StandError
+from thermostand.foundation.errors import DeviceError, NotReset, StandError
 from thermostand.foundation.events import COMMAND, FLAP_NOT_SHUT, FLAP_SHUT_IN_HOLD
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
@@ -55,7 +55,7 @@ async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
 
 
 async def end_endless_holds(gate: Gate, hub: Hub, clock: Clock, latch: Latch, limit_h: float) -> None:
-    """For virtual time, until cancelled. NotCleared when what is latched needs an operator and no command came for
+    """For virtual time, until cancelled. NotReset when what is latched needs an operator and no command came for
     30 min, StandError when the gate has been closed for `limit_h` without interruption."""
     since_ns: int | None = None  # the gate has been closed
     waits_ns: int | None = None  # the hold has waited for an operator
@@ -82,7 +82,7 @@ async def end_endless_holds(gate: Gate, hub: Hub, clock: Clock, latch: Latch, li
                 waits_ns = now_ns
             elif now_ns - waits_ns >= seconds_ns(_CLEARED_WITHIN_S):
                 minutes = _CLEARED_WITHIN_S / 60
-                raise NotCleared(f"held for {minutes:g} min of virtual time, and nobody cleared it: {fault.text}")
+                raise NotReset(f"held for {minutes:g} min of virtual time, and nobody reset it: {fault.text}")
             if now_ns - since_ns >= seconds_ns(3600.0 * limit_h):
                 reasons = fault.text if fault else ", ".join(sorted(gate.reasons))
                 raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody continued it")

@@ -42,7 +42,7 @@ class RunRecorder(Recording, Protocol):
     """Of what is recorded now, by a run or between runs."""
 
     def refound(self) -> None:
-        """An operator has cleared the loss of its folder."""
+        """An operator has reset the loss of its folder."""
         ...
 
 
@@ -66,7 +66,7 @@ class RunGuest(Protocol):
 class OpenStand:
     """The open stand. `recorder` is what heat depends on; set it before `prepare`.
 
-    is_for_one: it is closed with its one guest; else a trip stays until an operator clears it, guest or not. latch:
+    is_for_one: it is closed with its one guest; else a trip stays until an operator resets it, guest or not. latch:
     whether the stand has tripped. background: tasks that must not end, from the opening on. patience: with the disk,
     when the last guest has left and the stand is safe.
     """
@@ -92,7 +92,7 @@ class OpenStand:
             raise ValueError("a stand is guarded when it is prepared")
         return self._guard
 
-    def clear(self) -> str:
+    def reset(self) -> str:
         """An operator has removed the cause of what is latched: the gate is let go, and what is still wrong trips
         again, which is returned in words; "" when nothing is wrong."""
         if self.latch.fault is not None:
@@ -192,7 +192,7 @@ class OpenStand:
             self._guard.recording_ended()
 
     def left(self) -> None:
-        """The guest has gone, and what it alone was held for counts no more. A fault stays until it is cleared."""
+        """The guest has gone, and what it alone was held for counts no more. A fault stays until it is reset."""
         self.guest = None
         if self.is_for_one:
             return
@@ -221,7 +221,7 @@ class OpenStand:
 
     def _release(self) -> None:
         """The guard's hold is over. Of a folder that is lost another one is made."""
-        self.latch.clear()
+        self.latch.reset()
         self.assembly.stand.chamber.permits.forgive()
         self.assembly.stand.safety.forgive()
         if self.recorder is not None:

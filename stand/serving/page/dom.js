@@ -76,10 +76,10 @@ export function bytes(count) {
 
 export const words = (name) => name.replace("setpoint", "set-point").replace(/_degC$/, " °C").replace(/_deg$/, ", °").replace(/_(mm|s|K|px|Wh)$/, ", $1").replaceAll("_", " ");
 
-// Resume, while a trip is not cleared: why not, beside the button.
+// Resume, while a trip is not reset: why not, beside the button.
 export function hold_resumes(place, note, { fault }) {
   for (const button of place.querySelectorAll("button[data-resume]")) button.disabled = Boolean(fault);
-  say(note, fault && place.querySelector("button[data-resume]") ? "The stand has tripped: look at it and clear it, above; then a run can be resumed." : "");
+  say(note, fault && place.querySelector("button[data-resume]") ? "The stand has tripped: look at it and reset it, above; then a run can be resumed." : "");
 }
 
 export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

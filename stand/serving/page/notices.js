@@ -15,8 +15,8 @@ const ENDS = {
 };
 // What the guard does about a fault: FaultState.data of a rule of the stand.
 const DOES = {
-  abort: () => "It ends a run, which can be resumed once this is cleared.",
-  hold: ({ ends_itself }) => (ends_itself ? "It holds a run, which goes on by itself when this is over." : "It holds a run until somebody clears this."),
+  abort: () => "It ends a run, which can be resumed once this is reset.",
+  hold: ({ ends_itself }) => (ends_itself ? "It holds a run, which goes on by itself when this is over." : "It holds a run until somebody resets this."),
   warn: () => "It says so, and stops nothing.",
 };
 const FIRST = ["unsafe", "lost"]; // all else is of before while the connection is lost
@@ -78,16 +78,16 @@ export class Notices {
     const answer = h("p", { class: "answer", role: "status" });
     const review = h("div", { hidden: true });
     const readings = h("dl", { class: "facts" });
-    const clear = called("clear", h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "clear") }), (title) => `The cause is removed: ${title.toLowerCase()}`);
+    const reset = called("reset", h("button", { type: "button", class: "main", "data-order": "", onclick: () => order(answer, "reset") }), (title) => `The cause is removed: ${title.toLowerCase()}`);
     const open = h("button", { type: "button", "aria-expanded": "false", onclick: () => {
       review.hidden = !review.hidden;
       open.setAttribute("aria-expanded", String(!review.hidden));
-    } }, "Look at it and clear …");
+    } }, "Look at it and reset …");
     const { action, ends_itself, ...measured } = fault.data ?? {};
     const does = DOES[action]?.({ ends_itself }), data = Object.entries(measured).filter(([, value]) => typeof value !== "object");
     fill(review, h("div", { class: "row" }, h("div", { class: "grow" }, h("h3", {}, "What tripped"),
       h("dl", { class: "facts" }, [["rule", words(fault.rule)], ["found", fault.text], ["at", clock(seconds(fault.since_ns, state.utc_offset_ns), true)], ...(does ? [["the guard", does]] : []), ...data.map(([name, value]) => [words(name), String(value)])].map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]))),
-      h("div", { class: "grow" }, h("h3", {}, "Readings now"), readings)), h("div", { class: "row" }, clear));
+      h("div", { class: "grow" }, h("h3", {}, "Readings now"), readings)), h("div", { class: "row" }, reset));
     const since = h("p", {});
     const element = h("section", { class: "notice error", role: "alert" }, h("h2", {}, `Tripped: ${words(fault.rule)}`), h("p", {}, fault.text),
       since, h("div", { class: "row" }, open), review, answer);
@@ -136,7 +136,7 @@ export class Notices {
 
   halted(state) {
     const answer = h("p", { class: "answer", role: "status" });
-    const button = h("button", { type: "button", "data-order": "", onclick: () => order(answer, "clear", {}, "go on") }, "Go on with the queue");
+    const button = h("button", { type: "button", "data-order": "", onclick: () => order(answer, "reset", {}, "go on") }, "Go on with the queue");
     return { element: h("section", { class: "notice warning" }, h("h2", {}, "The queue is halted"), h("p", {}, state.queue_halted), h("div", { class: "row" }, button), answer) };
   }
 

@@ -6,7 +6,7 @@ import { PlanEdit, step_schema } from "./plan_edit.js";
 const SIGN = { done: "✓", under_way: "▶", waiting: "·", skipped: "⤼" };
 const WORD = { done: "done", under_way: "under way", waiting: "to come", skipped: "left out" };
 // Commands that have a place of their own.
-const PLACED = new Set(["stop", "pause", "continue", "clear", "skip", "extend", "edit", "submit", "cancel", "move", "resume", "device", "note", "fault"]);
+const PLACED = new Set(["stop", "pause", "continue", "reset", "skip", "extend", "edit", "submit", "cancel", "move", "resume", "device", "note", "fault"]);
 const SHOWN_DONE = 3;
 const MOST_ROWS = 300;
 

@@ -33,7 +33,7 @@ from thermostand.stand.serving.secop.modules import (
 from thermostand.stand.serving.secop.secop_lines import Refusal
 
 CHAMBER, RUN = "chamber", "run"
-_NAMES = {STOP: "stop", "clear": "clear_errors"}  # that SECoP has itself; all others are our own
+_NAMES = {STOP: "stop", "reset": "clear_errors"}  # that SECoP has itself; all others are our own
 _INFOS: dict[object, Callable[[], datainfo.DataInfo]] = {
     str: datainfo.text,
     int: datainfo.whole,

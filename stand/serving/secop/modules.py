@@ -182,7 +182,7 @@ def driven(seen: ModuleView, channel: str, read_ns: int) -> tuple[int, str]:
     if code == ERROR:
         return code, sentence
     if state.fault is not None:
-        return ERROR, f"the stand has tripped: {state.fault.text}; clear it once the cause is removed"
+        return ERROR, f"the stand has tripped: {state.fault.text}; reset it once the cause is removed"
     if seen.drive.is_busy(read_ns):
         return BUSY, "under way"
     if code == IDLE and state.phase != "idle":
