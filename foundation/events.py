@@ -429,7 +429,7 @@ RECORDING_LOST = event("recording_lost", "error", _recording_lost, _SHOW_SESSION
 SEARCH_FAILED = event("search_failed", "warning", "{said}", _NOTHING + ": frames are larger, and none is lost")
 SEGMENT_GIVEN_UP = event("segment_given_up", "warning", "{said}",
     "`stand session verify {folder}` reads all of it, once the run has ended")
-SALVAGED = event("salvaged", "warning", "{said}", "`stand session verify` reads what was recovered")
+SALVAGED = event("repaired", "warning", "{said}", "`stand session verify` reads what was recovered")
 TRIMMED = event("session.trimmed", "info", "{said}")
 
 

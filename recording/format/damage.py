@@ -27,7 +27,7 @@ DAMAGE = (
 
 
 class FileDamaged(SessionError):
-    """A file of a session is damaged or not what it should be: a salvage recovers what is sound."""
+    """A file of a session is damaged or not what it should be: a repair recovers what is sound."""
 
 
 @contextmanager

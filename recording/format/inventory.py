@@ -31,7 +31,7 @@ MOST_MISSING = 10_000  # segments; a night has hundreds
 
 class SegmentState(StrEnum):
     """finished: indexed, read by everything. unfinished: left by a recorder that is gone. recording: a recorder has it
-    open. damaged: the original of a salvaged segment, kept because not all of it could be recovered."""
+    open. damaged: the original of a repaired segment, kept because not all of it could be recovered."""
 
     FINISHED = "finished"
     UNFINISHED = "unfinished"

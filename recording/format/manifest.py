@@ -2,7 +2,7 @@
 
 It is written when a recording begins, each time a segment is finished, when the plan is known, and once more when the
 recording ends, always as a whole. A recorder that is killed between a segment's last name and this file leaves a
-segment that is not listed yet; a salvage, or the recorder that goes on, lists it. Its own `sha256` is that of all it
+segment that is not listed yet; a repair, or the recorder that goes on, lists it. Its own `sha256` is that of all it
 says, so that an edited one is found.
 """
 
@@ -94,7 +94,7 @@ class Manifest:
     """session: the record of that name of every segment. devices: name -> kind and channels, each with its unit, as
     they were declared. texts: name -> hash of what is attached. plan: how many `steps` and `frames` it has, {} before
     it is known. segments: the finished ones by their names within the session. journal: as it was when the recording
-    ended. ended: the recorder has finished everything. remade: a salvage has made this file of what was there, so that
+    ended. ended: the recorder has finished everything. remade: a repair has made this file of what was there, so that
     what was missing before is not known."""
 
     session: Mapping[str, str]

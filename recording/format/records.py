@@ -78,7 +78,7 @@ class MessageSpan:
 @dataclass(frozen=True, slots=True)
 class Head:
     """The first records of a segment. place: the record `segment`, its place in the session; salvaged: the record
-    `salvage`, empty for a segment that its recorder finished itself; span: by its index."""
+    `repair`, empty for a segment that its recorder finished itself; span: by its index."""
 
     session: dict[str, str]
     attachments: dict[str, str]

@@ -4,7 +4,7 @@ page ask.
 How deep it looks is for the caller to say (Depth): a list reads both ends of each file, `verify` every byte. What it
 finds are sentences, the same at any depth. An error is something that was recorded and cannot be trusted, or is not
 there; a note is a hole in what was measured that the recording itself reports: silence of a device, frames that the
-camera or a slow disk lost, a salvaged segment. How the run ended is another matter: a stopped run has sound files.
+camera or a slow disk lost, a repaired segment. How the run ended is another matter: a stopped run has sound files.
 
 What should be there is known from `session.json` (format/manifest.py), from the numbers of the segments, from the steps
 and their frames, and from the run's journal, whose entries are on the disk after what they describe.
@@ -474,12 +474,12 @@ class _Look:
                     file, by_name.get(f"{file.series}/{file.number:04d}{FINISHED}")
                 ):
                     yield _note(
-                        "a salvage recovered every message and kept the original because it was finished and damaged; "
+                        "a repair recovered every message and kept the original because it was finished and damaged; "
                         "remove it when it is not needed",
                         file.name,
                     )
                 case SegmentState.DAMAGED:
-                    yield _error("is an original that a salvage kept because it could not recover all of it", file.name)
+                    yield _error("is an original that a repair kept because it could not recover all of it", file.name)
                 case SegmentState.RECORDING:
                     yield _note("is being recorded now and was not read", file.name)
                 case SegmentState.FINISHED:
@@ -533,7 +533,7 @@ class _Look:
                 yield _error("records another place in the session than its name", file.name)
             if each.salvage:
                 said = ", ".join(f"{key}: {text}" for key, text in each.salvage.items())
-                yield _note(f"was salvaged ({said})", file.name)
+                yield _note(f"was repaired ({said})", file.name)
 
     def _changed_texts(self) -> Iterator[SessionFinding]:
         """Every segment has the same texts attached, and they are those that the recording began with."""
@@ -570,7 +570,7 @@ class _Look:
                 yield _error(f"{stated.text}{remake}", MANIFEST_NAME)
             return
         if stated.remade:
-            yield _note("was made by a salvage of what was there; what was missing then is not known", MANIFEST_NAME)
+            yield _note("was made by a repair of what was there; what was missing then is not known", MANIFEST_NAME)
         if self._metadata and dict(stated.session) != dict(self._metadata):
             yield _error("is of another session than the segments", MANIFEST_NAME)
             return
@@ -590,7 +590,7 @@ class _Look:
         if known is not None and known.size_bytes == each.file.size_bytes and each.sha256 in ("", known.sha256):
             return None
         if each.salvage or (known is None and not stated.ended):
-            why = "a salvage" if each.salvage else "its recorder"
+            why = "a repair" if each.salvage else "its recorder"
             return _note(f"{why} did not come to list it in {MANIFEST_NAME}; `stand session repair` does", name)
         if known is None:
             return _error(f"is none of the segments that {MANIFEST_NAME} lists", name)
@@ -900,7 +900,7 @@ def _why(
     """The evidence that more was recorded; "" when there is none. `done`: the steps that the telemetry has, empty when
     it was not read for them.
 
-    Without a journal a run leaves either the event of its end or a segment that a salvage has made; a recording with
+    Without a journal a run leaves either the event of its end or a segment that a repair has made; a recording with
     neither has lost its last segments, or was killed in the moment between two of them, and counts as incomplete.
     """
     is_ended = last is not None and last.kind == RUN_END
@@ -921,7 +921,7 @@ def _why(
 
 
 def _is_recovered(kept: SegmentFile, salvaged: SegmentSeen | None) -> bool:
-    """Whether the salvaged segment has every message of the original: its salvage lost no byte, and both have as many.
+    """Whether the repaired segment has every message of the original: its repair lost no byte, and both have as many.
     The original must reach the end of its data; of one that was cut short the number of messages is unknown."""
     if salvaged is None or salvaged.salvage.get("lost_bytes") != "0":
         return False

@@ -390,7 +390,7 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
 
 
 def _check_finished(path: Path, incomplete: Say | None) -> None:
-    """Segments that a killed recorder has left are not read: a salvage finishes them."""
+    """Segments that a killed recorder has left are not read: a repair finishes them."""
     left = [file.name for file in inventory(path) if file.state is SegmentState.UNFINISHED]
     if not left:
         return

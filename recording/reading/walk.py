@@ -206,13 +206,13 @@ def _times(one: int, other: int) -> int:
     return product
 
 
-# How far the heads of records in damaged bytes are believed, so that a salvage takes time in proportion to the file.
+# How far the heads of records in damaged bytes are believed, so that a repair takes time in proportion to the file.
 #
 # To find out whether a record proves itself all of it is read. Somebody can write a file full of heads of which each
 # claims all the rest. So when false claims have cost more than the file's size, the CRC that a head gives is compared
 # with that of its stretch first (RangeCrcs), which reads nothing twice, and of what is compressed only
 # the begin is inflated. When even so false claims have cost many times the size, nothing more is believed: the damaged
-# place goes to the end of the file, and the salvage keeps the original.
+# place goes to the end of the file, and the repair keeps the original.
 
 # Beyond it and the size of the file a claim is believed only where a CRC or a good begin speaks for it, so that a file
 # made to claim many records takes time in proportion to its size.

@@ -3,7 +3,7 @@
 What proves itself (recording/reading/walk.py) is copied message by message into a segment of the usual form, with a
 metadata record `salvage` that says from what. The copy is written as `NNNN.mcap.tmp`, synced and renamed; only then
 the original goes. It goes when the copy holds all of it but a block that was being written and never acknowledged;
-else it stays, as `NNNN.mcap.damaged`. A salvage that is killed is repeated, and one of a recording that is still
+else it stays, as `NNNN.mcap.damaged`. A repair that is killed is repeated, and one of a recording that is still
 under way (its recorder holds a lock on the segment) leaves that alone.
 """
 
@@ -162,7 +162,7 @@ def _tables(own: Survey, siblings: Iterable[Survey]) -> tuple[Mapping[int, Schem
     return schemas | own.schemas, channels | own.channels
 
 
-# How much of the files of a salvage has been read.
+# How much of the files of a repair has been read.
 
 ReportShare = Callable[[float, str], None]
 """Gets the share that is done, 0 to 1, and the file at hand."""
@@ -206,7 +206,7 @@ LEVELS = {FRAMES: ZSTD_LEVEL, TELEMETRY: 3}  # of zstd
 class Salvaged:
     """What became of one segment.
 
-    source: what was salvaged. path: the finished segment, None when nothing could be recovered. messages: how many of
+    source: what was repaired. path: the finished segment, None when nothing could be recovered. messages: how many of
     `source` are in it. lost_bytes: in its damaged places; a block that was never acknowledged is not lost. reason:
     what was wrong, BEING_RECORDED when it was left alone. kept: the original, when something of it is not in the copy.
     """
@@ -265,7 +265,7 @@ def _salvage_folder(folder: Path, finished_too: bool, share: ShareDone) -> Itera
 
 
 def _remove_left_over(copy: Path) -> None:
-    """Remove what a killed salvage has left; not what one that lives is writing."""
+    """Remove what a killed repair has left; not what one that lives is writing."""
     with _refusing(copy), _locked(copy) as fd:
         if fd is not None:
             copy.unlink()
@@ -294,7 +294,7 @@ def _refusing(path: Path) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        raise SessionError(f"{path}: cannot be salvaged and is left as it was ({error})") from error
+        raise SessionError(f"{path}: cannot be repaired and is left as it was ({error})") from error
 
 
 @contextmanager
@@ -318,7 +318,7 @@ def _locked(path: Path) -> Generator[int | None]:
 
 @dataclass(frozen=True, slots=True)
 class _Original:
-    """A segment under salvage: what proved itself of it, and the opening for its copy (None: not known)."""
+    """A segment under repair: what proved itself of it, and the opening for its copy (None: not known)."""
 
     path: Path
     finished: Path
@@ -433,7 +433,7 @@ def _copy_of(original: _Original) -> Generator[Path]:
 
 
 def _new_file(path: Path) -> BinaryIO:
-    """A file that was not there, locked. Another salvage may take it for left over until it is: then there is another
+    """A file that was not there, locked. Another repair may take it for left over until it is: then there is another
     one; FileExistsError when that is another's."""
     while True:
         file = path.open("xb")
@@ -519,7 +519,7 @@ def _reason(original: _Original) -> str:
 
 def _settle(original: _Original, path: Path | None, copy: Path | None = None) -> Salvaged:
     """Put the copy, if there is one, in its place and the original out of the way. Each step leaves a state from
-    which a salvage can continue."""
+    which a repair can continue."""
     folder = original.path.parent
     kept = None if original.is_all_there else _keep(original)
     if copy is not None:

@@ -88,7 +88,7 @@ class ManifestFile:
 
 
 def complete_manifest(directory: Path) -> str:
-    """List the finished segments that a killed recorder, or a salvage, has left unlisted; where there is no manifest
+    """List the finished segments that a killed recorder, or a repair, has left unlisted; where there is no manifest
     that counts, make one of what is there. Why that was made; "" when there was one. SessionError when no segment says
     which session it is, OSError when the disk refuses."""
     for left in directory.glob(f".{MANIFEST_NAME}.*.part"):
@@ -128,7 +128,7 @@ def _finished(directory: Path) -> list[SegmentFile]:
 
 def _with_segments(directory: Path, manifest: Manifest) -> Manifest:
     """With the finished segments of the session that are not listed yet: those of the last moments before a kill, and
-    those that a salvage has made. One that cannot be read, or is another session's, is left out."""
+    those that a repair has made. One that cannot be read, or is another session's, is left out."""
     for file in _finished(directory):
         with suppress(SessionError):
             head = read_head(file.path)

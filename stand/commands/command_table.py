@@ -66,7 +66,7 @@ app = lazy_app(
         "token": Lazy("thermostand.stand.commands.token_cli", "Tokens for the network: add, list, remove, login."),
         "session": Lazy(
             "thermostand.stand.commands.sessions.session_commands",
-            "Recorded sessions: list, look at, verify, salvage, replay, export, trim.",
+            "Recorded sessions: list, look at, verify, repair, replay, export, trim.",
         ),
     },
     has_completion=True,

@@ -127,7 +127,7 @@ def _interruption(
     if not entries or not (isinstance(first, Begun) or journal.damage):
         raise SessionError(f"{directory}: its run had not begun when it was killed; begin a new run")
     _check_may_go_on(directory, folded((), entries), reset)
-    with late_progress("salvage", 1.0) as report:
+    with late_progress("repair", 1.0) as report:
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
     begun = first if isinstance(first, Begun) else _recorded_begun(session)

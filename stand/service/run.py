@@ -424,7 +424,7 @@ async def _salvaged(job: Job, clock: Clock, disk: DiskProcess | None) -> tuple[S
             return tuple(await repair.call(salvage_unfinished, job.out))
         finally:
             repair.close()
-    with late_progress("salvage", 1.0) as report:
+    with late_progress("repair", 1.0) as report:
         return tuple(await asyncio.to_thread(salvage_unfinished, job.out, report))
 
 

@@ -92,13 +92,13 @@ def test_every_stretch_between_several_holes_is_delivered(damaged, series):
     assert read_segment(done.path) == written.untouched(data)
     assert 0 < done.messages < len(written.messages)
     assert "5 damaged places" in done.reason
-    assert metadata_of(done.path, "salvage")["damaged_places"] == "5"
+    assert metadata_of(done.path, "repair")["damaged_places"] == "5"
 
 
 def test_a_copy_says_from_what_it_was_made_and_reads_like_a_recording(damaged):
     folder, _, _ = damaged(FRAMES, lambda data: data[:-160])
     (done,) = salvage_session(folder.parent)
-    assert metadata_of(done.path, "salvage") == {
+    assert metadata_of(done.path, "repair") == {
         "source": "0001.mcap.part",
         "reason": done.reason,
         "messages": "46",

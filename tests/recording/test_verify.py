@@ -147,7 +147,7 @@ async def test_a_salvaged_segment_within_the_session_is_a_note(tmp_path):
     tear(directory / "telemetry" / "0001.mcap", chunk=1)
     salvage_session(directory)
     assert errors(directory) == []
-    assert any(note.startswith("note: telemetry/0001.mcap: was salvaged (source: 000") for note in notes(directory))
+    assert any(note.startswith("note: telemetry/0001.mcap: was repaired (source: 000") for note in notes(directory))
 
 
 @pytest.mark.parametrize("series", ["telemetry", "frames"])
@@ -201,7 +201,7 @@ async def test_an_original_from_which_everything_was_recovered_is_a_note(session
     assert errors(session)
     salvage_session(session)
     assert errors(session) == []
-    assert notes(session)[0].startswith(f"note: {name}.damaged: a salvage recovered")
+    assert notes(session)[0].startswith(f"note: {name}.damaged: a repair recovered")
 
 
 async def test_an_original_from_which_something_is_lost_stays_an_error(session):
@@ -215,7 +215,7 @@ async def test_an_original_from_which_something_is_lost_stays_an_error(session):
     kept, frame_lost = errors(session)
     assert kept.startswith("error: frames/0001.mcap.damaged: is an original")
     assert frame_lost.startswith("error: 1 frame of capture")
-    assert notes(session)[0].startswith("note: frames/0001.2.mcap.damaged: a salvage recovered")
+    assert notes(session)[0].startswith("note: frames/0001.2.mcap.damaged: a repair recovered")
 
 
 async def test_an_original_that_was_cut_short_stays_an_error(session):

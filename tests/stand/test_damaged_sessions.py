@@ -88,7 +88,7 @@ def holed(session: Path) -> Path:
 
 def test_what_only_looks_needs_no_flag(holed: Path):
     assert words_everywhere(holed, 1) == ("complete", "incomplete")
-    assert ask("salvage", holed).stdout == "nothing to salvage\n"
+    assert ask("repair", holed).stdout == "nothing to repair\n"
 
 
 @pytest.mark.parametrize(("command", "option"), USES)

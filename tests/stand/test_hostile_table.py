@@ -34,7 +34,7 @@ LOOKS = {
 }
 CHANGES = {
     "resume": ("stand", "resume", "SESSION"),
-    "salvage": ("stand", "session", "salvage", "SESSION"),
+    "repair": ("stand", "session", "repair", "SESSION"),
 }
 
 
@@ -115,7 +115,7 @@ def test_every_command_answers_on_a_hostile_session(row: str, whole: Path, tmp_p
         if name in USES and row in WITH_HOLES:
             assert answer.status in (1, 2), (name, answer)
             assert "--incomplete" in answer.said, (name, answer)
-    again = ask_all(*words(CHANGES["salvage"], session, tmp_path / "out"))
+    again = ask_all(*words(CHANGES["repair"], session, tmp_path / "out"))
     check("salvage, once more", again)
     assert again.status in (0, 2), again  # what a first salvage could not recover a second one does not find
     check("verify, once more", ask_all(*words(LOOKS["verify"], session, tmp_path / "out")))

@@ -16,7 +16,7 @@ from thermostand.stand.commands.sessions.session_commands import app
 
 
 def test_short_work_is_not_shown(capsys: pytest.CaptureFixture[str]):
-    with late_progress("salvage", 10.0) as report:
+    with late_progress("repair", 10.0) as report:
         for done in range(10):
             report(done, "0001.mcap")
     assert capsys.readouterr().err == ""
@@ -26,19 +26,19 @@ def test_long_work_is_shown_from_its_first_report_on_and_then_at_each_tenth(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("thermostand.foundation.progress._LATE_NS", 0)
-    with late_progress("salvage", 10.0) as report:
+    with late_progress("repair", 10.0) as report:
         for done in (0.01, 0.02, 1.0, 1.5, 9.0):
             report(done, "0001.mcap")
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[1] for line in lines] == ["0%", "10%", "90%"]
-    assert all(line.startswith("salvage: ") and line.endswith("0001.mcap") for line in lines)
+    assert all(line.startswith("repair: ") and line.endswith("0001.mcap") for line in lines)
 
 
 def test_a_salvage_and_a_verification_say_how_far_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("thermostand.foundation.progress._LATE_NS", 0)
     write_segment(tmp_path / "s" / TELEMETRY, TELEMETRY, range(3), finish=True)
     write_segment(tmp_path / "s" / FRAMES, FRAMES, range(3))
-    for command in ("salvage", "verify"):
+    for command in ("repair", "verify"):
         said = CliRunner().invoke(app, [command, str(tmp_path / "s")]).stderr
         assert re.search(rf"^{command}: +\d+%  0:00:\d\d left  ", said), said
 

@@ -23,7 +23,7 @@ def flip_in_frame(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["list", "note", "tag", "archive", "info", "verify", "salvage", "replay", "export", "trim"]
+    "command", ["list", "note", "tag", "archive", "info", "verify", "repair", "replay", "export", "trim"]
 )
 def test_every_command_explains_itself_with_an_example(command: str):
     assert f"Example: stand session {command}" in " ".join(ask(command, "--help").stdout.split())
@@ -221,15 +221,15 @@ def test_salvage_finishes_what_is_unfinished_in_every_session(session: Path):
     whole = Path(shutil.copytree(session, session.parent / "other"))
     path = session / "frames" / "0001.mcap"
     path.rename(path.with_name("0001.mcap.part"))
-    (line,) = ask("salvage", session.parent).stdout.splitlines()
+    (line,) = ask("repair", session.parent).stdout.splitlines()
     assert line.startswith(f"{session.name}/frames/0001.mcap.part: 8 messages in 0001.mcap (")
     assert Session.open(session).frame_count == Session.open(whole).frame_count == COUNT
-    assert ask("salvage", session).stdout == "nothing to salvage\n"
+    assert ask("repair", session).stdout == "nothing to repair\n"
 
 
 def test_salvage_fails_when_something_is_lost_and_keeps_the_original(session: Path):
     flip_in_frame(session / "frames" / "0001.mcap")
-    (line,) = ask("salvage", session, status=1).stdout.splitlines()
+    (line,) = ask("repair", session, status=1).stdout.splitlines()
     assert f"{session.name}/frames/0001.mcap: 6 messages in 0001.mcap, " in line
     assert "kept as 0001.mcap.damaged" in line
 

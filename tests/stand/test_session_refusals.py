@@ -9,7 +9,7 @@ import pytest
 from tests.stand.session_commands import ask, refused
 
 
-@pytest.mark.parametrize("command", ["info", "verify", "replay", "salvage"])
+@pytest.mark.parametrize("command", ["info", "verify", "replay", "repair"])
 def test_what_is_no_session_is_refused(tmp_path: Path, command: str):
     (line,) = ask(command, tmp_path / "nowhere", status=2).stderr.splitlines()
     assert line.startswith(f"error: {tmp_path / 'nowhere'}: ")

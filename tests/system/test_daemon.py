@@ -171,7 +171,7 @@ def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(s
         (run,) = [path for path in served.out.iterdir() if path.name.endswith(f"-{name}")]
         events = Session.open(run).events()
         assert events[-1].data.get("status") == "complete"
-        assert [event.text for event in events if event.kind == "salvaged"] == []
+        assert [event.text for event in events if event.kind == "repaired"] == []
 
 
 def test_a_stop_ends_the_run_and_leaves_the_daemon_with_a_safe_stand(serve: Callable[[], Served]):

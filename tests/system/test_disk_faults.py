@@ -176,10 +176,10 @@ class Stand:
 
     def series_of(self, directory):
         """Each message of a session once it is salvaged, by series."""
-        with_copy = self.root.parent / "salvaged" / directory.name
+        with_copy = self.root.parent / "repaired" / directory.name
         shutil.rmtree(with_copy.parent, ignore_errors=True)
         shutil.copytree(directory, with_copy)
-        self.program("session", "salvage", with_copy)
+        self.program("session", "repair", with_copy)
         found = {series: Counter(read_series(with_copy, series)) for series in (TELEMETRY, FRAMES)}
         shutil.rmtree(with_copy.parent)
         return found
@@ -332,7 +332,7 @@ def salvaged(stand, name, hit, state):
     shutil.rmtree(scratch, ignore_errors=True)
     directory = shutil.copytree(stand.sessions / name, scratch / name)
     yield from journalled(stand, name, directory, hit)
-    said = stand.program("session", "salvage", directory)
+    said = stand.program("session", "repair", directory)
     yield from traceback_in(said)
     for series, true in stand.truth[name].items():
         segments = [Counter(read_segment(path)) for path in sorted((directory / series).glob("*.mcap"))]

@@ -59,7 +59,7 @@ async def test_a_run_first_salvages_what_a_killed_one_has_left(tmp_path: Path, o
         hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
 
     await run_virtual(ordered, tmp_path / "out", None, watch)
-    assert "salvaged" in [event.kind for event in events]
-    assert events[0].kind == "salvaged"
+    assert "repaired" in [event.kind for event in events]
+    assert events[0].kind == "repaired"
     assert "killed/frames/0000.mcap" in events[0].text
     assert Session.open(left).frame_count == Session.open(whole).frame_count - 2

@@ -109,7 +109,7 @@ async def test_what_happened_before_the_recording_began_is_in_it(tmp_path: Path,
         await run_virtual(order(SHORTER), out, None, at_step("soak", lambda: os.kill(os.getpid(), signal.SIGINT)))
     (directory,) = set(out.iterdir()) - {killed}
     events = Session.open(directory).events()
-    assert [event.kind for event in events[:1]] == ["salvaged"]
+    assert [event.kind for event in events[:1]] == ["repaired"]
     assert killed.name in events[0].text
     assert events[0].time_ns < next(event.time_ns for event in events if event.kind == "run.start")
 

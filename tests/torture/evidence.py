@@ -95,7 +95,7 @@ class Evidence:
             for found in (self.unreadable, self.said, self.marks, self.frames, self.metas, self.temperatures):
                 found.clear()
             for session in self.sessions:
-                program = [sys.executable, "-m", "thermostand.stand.cli", "session", "salvage", str(session)]
+                program = [sys.executable, "-m", "thermostand.stand.cli", "session", "repair", str(session)]
                 forked.run(program, cwd=ROOT, capture_output=True)
             self._read_all()
 

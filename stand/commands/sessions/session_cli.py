@@ -1,4 +1,4 @@
-"""The `stand session` commands: recorded sessions listed, shown, verified, salvaged, replayed, exported and trimmed."""
+"""The `stand session` commands: recorded sessions listed, shown, verified, repaired, replayed, exported and trimmed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from thermostand.stand.commands.sessions.session_text import info_json, info_lin
 
 app = App(
     no_args_is_help=True,
-    help="Recorded sessions: list, look at, verify, salvage, replay, export, trim.\n\n"
+    help="Recorded sessions: list, look at, verify, repair, replay, export, trim.\n\n"
     "Example: stand session info sessions/20260101T180000Z-thermal-cycle",
 )
 
@@ -113,7 +113,7 @@ def _part_of(report: Report, done_bytes: int, size_bytes: int) -> Callable[[floa
 
 
 @app.command()
-def salvage(
+def repair(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="A recorded session, or a folder of sessions.")],
 ) -> None:
     """Finish unfinished segments and repair damaged ones; nothing valid is lost. Status 1 when something was not
@@ -124,13 +124,13 @@ def salvage(
     sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
     done: list[Salvaged] = []
     done_bytes = 0
-    with late_progress("salvage", sum(sizes.values())) as report:
+    with late_progress("repair", sum(sizes.values())) as report:
         for path, size_bytes in sizes.items():
             for salvaged in salvage_session(path, _part_of(report, done_bytes, size_bytes)):
                 done.append(salvaged)
             done_bytes += size_bytes
     data = [{**asdict(each), "text": salvage_line(each)} for each in done]
-    show(data, [one_line(salvage_line(each)) for each in done] or ["nothing to salvage"])
+    show(data, [one_line(salvage_line(each)) for each in done] or ["nothing to repair"])
     if any(salvaged.kept for salvaged in done):
         raise typer.Exit(FAILED)
 

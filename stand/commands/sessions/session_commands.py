@@ -7,7 +7,7 @@ from thermostand.foundation.usage import Lazy, lazy_app
 _LIST, _WORK = "thermostand.stand.commands.sessions.session_list_cli", "thermostand.stand.commands.sessions.session_cli"
 
 app = lazy_app(
-    "Recorded sessions: list, look at, verify, salvage, replay, export, trim.\n\n"
+    "Recorded sessions: list, look at, verify, repair, replay, export, trim.\n\n"
     "Example: stand session info sessions/20260101T180000Z-thermal-cycle",
     {
         "list": Lazy(_LIST, "The sessions in a folder: when, how long, how they ended, tags and notes."),
@@ -19,7 +19,7 @@ app = lazy_app(
         ),
         "info": Lazy(_WORK, "What a session holds: when, steps, frames, gaps, temperatures, events, versions."),
         "verify": Lazy(_WORK, "Read every byte of a session and say what is damaged or missing."),
-        "salvage": Lazy(_WORK, "Finish unfinished segments and repair damaged ones."),
+        "repair": Lazy(_WORK, "Finish unfinished segments and repair damaged ones."),
         "replay": Lazy(_WORK, "Publish a session again, at its own pace or faster."),
         "export": Lazy(_WORK, "A session as images, tables or one file for a viewer."),
         "trim": Lazy(_WORK, "A part of a session as a new one."),
