@@ -77,7 +77,7 @@ def test_every_command_answers_on_what_is_no_file(session: Path, hostile: str, t
         ["replay", session, "--speed", "max", "--record", tmp_path / "replayed"],
         ["export", session, "--out", tmp_path / "exported"],
         ["trim", session, "--from", "step:1", "--to", "+1h", "--out", tmp_path / "trimmed"],
-        ["salvage", session],
+        ["repair", session],
     )
     for command in commands:
         result = CliRunner().invoke(app, [str(word) for word in command])
