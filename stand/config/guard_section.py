@@ -83,7 +83,7 @@ class GuardConfig(Document):
     flap_capture_s: in all. disk_low_s: how long the recorder may refuse frames. camera_temperature_s: how long a
     powered camera with frames to come may have no temperature.
     pause_limit_h: how long an operator's pause, or a prompt that nobody answers, may keep the chamber at its set-point,
-    hours. overrides: paths of values outside the ranges of safe_ranges.py, which are refused unless they are named here.
+    hours. overrides: paths of values outside the ranges of safe_ranges.py, which are otherwise refused.
     channels: limits for what any device measures, by its channel, as `lab.pressure`.
     added: settings of rules that other packages add, by their names. safe_limit_s: how long, at the end of a run, it is
     tried to have every actuator confirm that it is safe.

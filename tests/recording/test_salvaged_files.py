@@ -235,7 +235,7 @@ def test_a_full_disk_leaves_the_original_as_it_was(tmp_path, night):
         (disk / "night" / FRAMES).mkdir(parents=True)
         part = disk / "night" / FRAMES / "0000.mcap.part"
         part.write_bytes(data)
-        with pytest.raises(SessionError, match=r"cannot be salvaged .*No space left"):
+        with pytest.raises(SessionError, match=r"cannot be repaired .*No space left"):
             salvage_unfinished(disk)
         assert names(disk) == ["night/frames/0000.mcap.part"]
         assert part.read_bytes() == data

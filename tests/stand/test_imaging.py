@@ -160,7 +160,7 @@ async def test_a_supply_that_was_cut_goes_off_with_every_demand_and_is_confirmed
             await here.stand.imaging.supply.switch_on()
         here.stand.cut_camera()
         assert await here.stand.safety.confirmed(60)
-        here.stand.latch.clear()
+        here.stand.latch.reset()
         here.stand.safety.forgive()
         await here.stand.imaging.supply.switch_on()
         here.calls.clear()

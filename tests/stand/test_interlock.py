@@ -38,7 +38,7 @@ def test_nothing_may_move_while_a_run_is_ended_or_something_is_latched_and_a_pau
     gate.clear(STOPPING)
     latch.bar()
     assert gate.reasons == {OPERATOR, INTERLOCK}
-    latch.clear()
+    latch.reset()
     assert gate.reasons == {OPERATOR}
     interlock.check()
     assert mover.times == 2

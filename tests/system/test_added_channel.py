@@ -18,7 +18,7 @@ from tests.recording.test_export import csv_rows
 from tests.system.test_run import at_step
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
-from thermostand.foundation.errors import ConfigError, NotCleared, StandTripped
+from thermostand.foundation.errors import ConfigError, NotReset, StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Channel, Reading
@@ -280,7 +280,7 @@ async def test_a_limit_is_set_on_it(
     guard = {"channels": {channel: {"after_s": 20, **limits}}}
     run = run_virtual(order(RECIPE, devices={"lab": lab()}, guard=guard), tmp_path / "out", None, watch)
     if action in ("abort", "hold"):
-        with pytest.raises(StandTripped if action == "abort" else NotCleared):
+        with pytest.raises(StandTripped if action == "abort" else NotReset):
             await run
     else:
         await run

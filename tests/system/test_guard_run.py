@@ -23,7 +23,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.alerts_section import AlertsConfig
-from thermostand.stand.running.memory.entries import Cleared, Tripped
+from thermostand.stand.running.memory.entries import Reset, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import interruption

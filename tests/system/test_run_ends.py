@@ -23,7 +23,7 @@ from tests.system.resume_process import Daemon
 from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, ignore
 from thermostand.foundation import calls
-from thermostand.foundation.errors import NotCleared, StandTripped
+from thermostand.foundation.errors import NotReset, StandTripped
 from thermostand.foundation.events import AlertCause
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
@@ -72,7 +72,7 @@ async def test_people_are_alerted_of_a_step_that_fails_and_of_the_run_that_ends_
 ):
     ordered = order(SHORTER)
     watch = at_step("soak", lambda: break_now(ordered, "flap.jam", 500))
-    with pytest.raises(NotCleared):
+    with pytest.raises(NotReset):
         await run_virtual(ordered, tmp_path / "out", None, watch)
     (directory,) = (tmp_path / "out").iterdir()
     events = Session.open(directory).events()
