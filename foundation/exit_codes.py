@@ -17,7 +17,7 @@ from thermostand.foundation.usage import ended, failed
 FAILED = 1
 BAD_INPUT = 2
 NOT_REPORTED = 3
-NOT_CLEARED = 4
+NOT_RESET = 4
 INTERRUPTED = 130
 
 
@@ -33,7 +33,7 @@ def one_line_errors() -> Generator[None]:
     except Interrupted as error:
         raise ended(error, INTERRUPTED) from error
     except NotReset as error:
-        raise _failed(error, NOT_CLEARED) from error
+        raise _failed(error, NOT_RESET) from error
     except (StandError, OSError) as error:
         raise _failed(error, FAILED) from error
     except KeyboardInterrupt as error:

@@ -17,11 +17,11 @@ from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.journal_lines import journal_lines, lines_of
 from thermostand.stand.running.memory.entries import (
     Begun,
-    Cleared,
     Dwell,
     Ended,
     Gap,
     Held,
+    Reset,
     StepChanged,
     Tripped,
     decoded,
@@ -36,7 +36,7 @@ ENTRIES = [
     Held(5, "operator", False),
     Gap(5, 8),
     Tripped(6, "over_temperature", "too hot"),
-    Cleared(8),
+    Reset(8),
     StepChanged(9, "a1", "done"),
     Ended(10, "stopped", "stopped by the operator: “✓”\n"),
 ]

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from tests.asking import ask
 from thermostand.foundation.clock import NS_PER_S, seconds_ns
-from thermostand.foundation.exit_codes import FAILED, NOT_CLEARED
+from thermostand.foundation.exit_codes import FAILED, NOT_RESET
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.tasks import cancelled
@@ -149,7 +149,7 @@ def test_a_virtual_run_that_nobody_clears_ends_safe_with_its_own_status_and_is_r
     config.write_text(config_text(simulation={"faults": ["flap.jam@735:60"]}))
     recipe.write_text(RECIPE)
     ended = CliRunner().invoke(app, ["run", str(recipe), "--config", str(config), "--out", str(out), "--virtual-time"])
-    assert ended.exit_code == NOT_CLEARED
+    assert ended.exit_code == NOT_RESET
     (directory,) = out.iterdir()
     session = Session.open(directory)
     assert session.readings("relays.heater_enable")[1][-1] == session.readings("regulator.running")[1][-1] == 0

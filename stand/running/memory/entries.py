@@ -11,7 +11,7 @@ journal (recording/reading/journal_lines.py).
     Extended     a soak is made longer by an operator
     Edited       the steps from a place on are replaced, by an operator or by the plan's own decision
     Tripped      the guard has made the stand safe, and why
-    Cleared      an operator has removed the cause of a trip
+    Reset        an operator has removed the cause of a trip
     Ended        complete, stopped by the operator, tripped, or failed
 
 Not written: what the recording proves (Taken, Cooled), and what a Gap makes void (Due, Readying, Restored).
@@ -197,12 +197,12 @@ class Cooled:
     time_ns: int
 
 
-Written = Begun | StepChanged | Dwell | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Cleared | Ended
+Written = Begun | StepChanged | Dwell | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Reset | Ended
 Entry = Written | Taken | Due | Readying | Restored | Cooled
 Change = Skipped | Extended | Edited  # of the plan
 
 _WRITTEN: dict[str, type[Written]] = {"Step": StepChanged} | {
-    kind.__name__: kind for kind in (Begun, Dwell, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Cleared, Ended)
+    kind.__name__: kind for kind in (Begun, Dwell, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Reset, Ended)
 }
 _NAMES = {kind: name for name, kind in _WRITTEN.items()}
 
