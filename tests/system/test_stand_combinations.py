@@ -20,6 +20,7 @@ from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
+from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.recipe import Recipe
@@ -284,6 +285,8 @@ async def test_each_combination_runs_and_records_what_it_lacks(combination: Comb
     session = Session.open(await run_virtual(order, tmp_path / "out", 1, lambda _: None))
     assert session.run == "complete"
     assert len(session.frame_metas()) == len(data["cameras"])
+    checked = verify(session.path)  # all that each kind of device declares is read
+    assert checked.is_sound, checked.findings
     reported = [event.data["what"] for event in session.events() if event.kind == "absent"]
     assert reported == [each.what for each in absences(order.config)]
     air_degC = session.readings("thermometers.air")[1]
