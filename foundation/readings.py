@@ -28,8 +28,8 @@ Cause = Literal["", "wire", "device", "alarm", "doubt"]
 
 class Channel(NamedTuple):
     """What a device measures. name: the second part of its readings' channel (`air` of `thermometers.air`). unit: of
-    its readings, any, 1 for a flag or count, "" for what has none. kind: what it is of, in one word (temperature, pressure,
-    flag); of the first position in mm and the first in deg the table's pose is made for viewers."""
+    its readings, any, 1 for a flag or count, "" for what has none. kind: what it is of, in one word (temperature,
+    pressure, flag); of the first position in mm and the first in deg the table's pose is made for viewers."""
 
     name: str
     unit: str
