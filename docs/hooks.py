@@ -55,9 +55,11 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in what is made or included, and write equations as MathML, which browsers draw by themselves."""
+    """Fill in what is made or included, and write equations as MathML, which browsers draw by themselves. A default that
+    is nothing is not shown."""
     markdown = re.sub(r"<!-- made: (\w+) -->", lambda found: MADE[found[1]](), markdown)
     markdown = re.sub(r"<!-- included: (\S+) -->", lambda found: _included(ROOT / found[1]), markdown)
+    markdown = markdown.replace("| `` |", "| |").replace("| `None` |", "| |")
     return markdown if "```math" not in markdown else _EQUATION.sub(_drawn, markdown)
 
 
@@ -68,7 +70,9 @@ _EQUATION = re.compile(r"```math\n(?P<block>.*?)\n```|(?P<code>```.*?```|`[^`\n]
 def _drawn(found: re.Match[str]) -> str:
     if found["code"]:
         return found[0]
-    return convert(found["block"], display="block") if found["block"] else convert(found["inline"])
+    if found["block"]:
+        return f'<div class="equation">{convert(found["block"], display="block")}</div>'
+    return f"<span>{convert(found['inline'])}</span>"  # a line that begins with <math> would be taken for a block
 
 
 def _included(path: Path) -> str:
