@@ -24,7 +24,7 @@ from thermostand.stand.imaging.imaging import Imaging
 from thermostand.stand.interlock import Interlock, Motions
 from thermostand.stand.latch import Latch
 from thermostand.stand.safety import Safety
-from thermostand.stand.table.stages import Table
+from thermostand.stand.table import Table
 
 _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor must not be worn
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class Column(NamedTuple):
+class ChannelColumn(NamedTuple):
     """The readings of a channel in order of time, (n,) each: instants of the stand's clock, ns since 1970, and values,
     NaN where the reading was BAD."""
 
@@ -120,7 +120,7 @@ class ReadingColumns:
             single = self._single.setdefault((batch.device, channel), [])
             single.append((self._count, reading.time_ns, reading.value))
 
-    def columns(self) -> dict[str, dict[str, Column]]:
+    def columns(self) -> dict[str, dict[str, ChannelColumn]]:
         """Device -> channel -> (time_ns, value) in order of time, of equal times in order of the files; SessionError
         when a value does not fit its quality."""
         parts: dict[tuple[str, str], list[Part]] = {}
@@ -131,7 +131,7 @@ class ReadingColumns:
             numbers, times_ns, values = zip(*single, strict=True)
             part = (np.array(numbers, np.int64), np.array(times_ns, np.int64), np.array(values, np.float64))
             parts.setdefault(key, []).append(part)
-        columns: dict[str, dict[str, Column]] = {form.name: {} for form in self._rows}
+        columns: dict[str, dict[str, ChannelColumn]] = {form.name: {} for form in self._rows}
         for (device, channel), of_channel in parts.items():
             columns.setdefault(device, {})[channel] = _sorted(of_channel)
         return columns
@@ -153,7 +153,7 @@ class ReadingColumns:
                 yield channel, (numbers[is_given], times_ns[is_given], values)
 
 
-def _sorted(parts: list[Part]) -> Column:
+def _sorted(parts: list[Part]) -> ChannelColumn:
     numbers, times_ns, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     order = np.lexsort((numbers, times_ns))
-    return Column(times_ns[order], values[order])
+    return ChannelColumn(times_ns[order], values[order])

@@ -16,7 +16,7 @@ from thermostand.foundation.items import Event, StepMark
 from thermostand.recording.format.layout import FRAMES
 from thermostand.recording.format.records import FramePlace
 from thermostand.recording.format.restarts import begins_of, is_superseded
-from thermostand.recording.reading.columns import Column
+from thermostand.recording.reading.columns import ChannelColumn
 from thermostand.recording.reading.interpolation import Float, interpolated
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class RecordedSession(Protocol):
         """The channels that have readings."""
         ...
 
-    def readings(self, channel: str) -> Column:
+    def readings(self, channel: str) -> ChannelColumn:
         """(time_ns, value); SessionError when there is no such channel."""
         ...
 

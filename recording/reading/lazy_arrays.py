@@ -29,13 +29,13 @@ from thermostand.recording.format.decoded_items import frame_of, recorded_image
 from thermostand.recording.format.images import ImageArray
 from thermostand.recording.format.records import FramePlace
 from thermostand.recording.format.utc_offsets import UtcOffsets
-from thermostand.recording.reading.columns import Column
+from thermostand.recording.reading.columns import ChannelColumn
 from thermostand.recording.reading.frames_table import FramesTable
 from thermostand.recording.reading.interpolation import interpolated
 from thermostand.recording.reading.recorded_devices import recorded_devices
 
 
-class Recorded(Protocol):
+class RecordedFrames(Protocol):
     """What is asked of a session, see there."""
 
     path: Path
@@ -44,7 +44,7 @@ class Recorded(Protocol):
     @property
     def telemetry_segments(self) -> tuple[Path, ...]: ...  # noqa: D102
     def units(self) -> Mapping[str, str]: ...  # noqa: D102
-    def readings(self, channel: str) -> Column: ...  # noqa: D102
+    def readings(self, channel: str) -> ChannelColumn: ...  # noqa: D102
     def frames_table(self) -> FramesTable: ...  # noqa: D102
 
 
@@ -61,7 +61,7 @@ class SessionArrays(Mapping[str, Dataset]):
     when the session is damaged there.
     """
 
-    def __init__(self, session: Recorded, places: Sequence[FramePlace], utc: Callable[[], UtcOffsets]) -> None:
+    def __init__(self, session: RecordedFrames, places: Sequence[FramePlace], utc: Callable[[], UtcOffsets]) -> None:
         self._session, self._utc_offsets, self._lock = session, utc, Lock()
         self._places: dict[str, list[FramePlace]] = {}
         for place in places:

@@ -54,7 +54,7 @@ from thermostand.recording.format.records import (
     telemetry_messages,
 )
 from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
-from thermostand.recording.reading.columns import Column, ReadingColumns
+from thermostand.recording.reading.columns import ChannelColumn, ReadingColumns
 from thermostand.recording.reading.frames_table import FramesTable, frames_table
 from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import Depth, Scan, frames_of_plan, scan
@@ -91,7 +91,7 @@ class Session:
         for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others
             with suppress(_Unreadable):  # it is reported when it is read
                 self._check(segment)
-        self._columns: dict[str, dict[str, Column]] = {}  # device -> channel -> column
+        self._columns: dict[str, dict[str, ChannelColumn]] = {}  # device -> channel -> column
         self._all_columns_read = False
         self._units: dict[str, str] = {}
         self._doubted: dict[str, list[int]] = {}
@@ -146,7 +146,7 @@ class Session:
         `lab.pressure (mbar)`."""
         return {channel: self._units[channel] for channel in self.channels()}
 
-    def readings(self, channel: str) -> Column:
+    def readings(self, channel: str) -> ChannelColumn:
         """(time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD; `.to_pandas()` is a
         Series of it. SessionError when the session has no such channel."""
         device = channel.partition(".")[0]
@@ -157,19 +157,19 @@ class Session:
             raise SessionError(f"{self.path}: has no channel {channel}; there are {', '.join(self.channels())}")
         return found
 
-    def believed(self, channel: str) -> Column:
+    def believed(self, channel: str) -> ChannelColumn:
         """As `readings`, without those that were recorded in doubt."""
         times_ns, values = self.readings(channel)
         kept = ~np.isin(times_ns, self._doubted.get(channel, []))
-        return Column(times_ns[kept], values[kept])
+        return ChannelColumn(times_ns[kept], values[kept])
 
-    def _all_columns(self) -> dict[str, Column]:
+    def _all_columns(self) -> dict[str, ChannelColumn]:
         if not self._all_columns_read:
             self._columns = self._read_columns(None)
             self._all_columns_read = True
         return {channel: column for columns in self._columns.values() for channel, column in columns.items()}
 
-    def _read_columns(self, device: str | None) -> dict[str, dict[str, Column]]:
+    def _read_columns(self, device: str | None) -> dict[str, dict[str, ChannelColumn]]:
         """Device -> channel -> column, of `device` alone (None: of all)."""
         found = ReadingColumns()
 

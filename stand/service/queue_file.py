@@ -243,7 +243,7 @@ def _opened(path: Path) -> Generator[int]:
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except FileNotFoundError as error:
-        raise NotThere(f"{path.parent}: no such folder; `stand queue add` makes it") from error
+        raise NotThere(f"{path.parent}: no such folder; `stand serve` makes it") from error
     except OSError as error:
         raise SessionError(f"{path.parent}: its queue cannot be locked ({error.strerror})") from error
     try:

@@ -1,1 +1,0 @@
-"""Where the target stands: the stages."""
