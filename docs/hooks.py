@@ -55,8 +55,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in what is made or included, and write equations as MathML, which browsers draw by themselves. A default that
-    is nothing is not shown."""
+    """Fill in what is made or included, and write equations as MathML, which browsers draw by themselves. A default
+    that is nothing is not shown."""
     markdown = re.sub(r"<!-- made: (\w+) -->", lambda found: MADE[found[1]](), markdown)
     markdown = re.sub(r"<!-- included: (\S+) -->", lambda found: _included(ROOT / found[1]), markdown)
     markdown = markdown.replace("| `` |", "| |").replace("| `None` |", "| |")
