@@ -21,7 +21,7 @@ app = lazy_app(
         "datasheet": Lazy(
             "thermostand.compensation.commands.fit_cli", "Write a camera's thermal datasheet, with uncertainties."
         ),
-        "anchor": Lazy(_FIT, "Fit a model to where the target is in a new session."),
+        "rereference": Lazy(_FIT, "Fit a model to where the target is in a new session."),
         "apply": Lazy(_APPLY, "Put points or images where they would have been at the reference temperature."),
         "export": Lazy(_APPLY, "Write the model for other programs: in Python with numpy only, in C, for ROS 2."),
         "calibrate": Lazy(

@@ -527,9 +527,9 @@ NOT_RESUMED = event("not_resumed", "error", "run {run} is not resumed by itself:
     "`stand reset`, then `stand resume`")
 RECORDING_RESTARTED = event("recording_restarted", "warning", "{session}: its writer was killed; the run is resumed",
     "see what killed it: `journalctl -k` tells of a lack of memory")
-HOUSE_NOT_RECORDED = event("house_not_recorded", "error",
+IDLE_LOG_NOT_RECORDED = event("idle_log_not_recorded", "error",
     "nothing is recorded between runs, so nothing is heated: {said}", _SEE_DISK)
-HOUSE_NOT_ENDED = event("house_not_ended", "warning", "{said}", _SEE_DISK)
+IDLE_LOG_NOT_ENDED = event("idle_log_not_ended", "warning", "{said}", _SEE_DISK)
 """The record between runs that was to be completed, or to be followed by today's."""
 IDLE_LOGS_REMOVED = event("idle_logs_removed", "info",
     "records between runs older than {days} days were removed: {names}")

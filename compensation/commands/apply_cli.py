@@ -147,21 +147,21 @@ def _opened(path: Path, model: DriftModel, camera: str | None, incomplete: bool)
     session = open_session(path, camera, incomplete)
     if camera is None:
         take(session, name_of(session, model.facts.camera_serial))
-    _offer_anchor(model, session)
+    _offer_rereference(model, session)
     return session
 
 
 # Not done by itself: it would take out a shift of the target that somebody wants to see, and gains 0.3 to 1.2 mpx where
 # nothing was moved.
-def _offer_anchor(model: DriftModel, session: Session) -> None:
+def _offer_rereference(model: DriftModel, session: Session) -> None:
     """A message where the model is of other nights, and this one has reference frames that would take out what differs
     between them."""
     if model.form != "thermal" or session.metadata.get("session_id") in model.facts.session_ids:
         return
     if any(mark.parameters.get("role") == str(Role.REFERENCE) for mark in session.steps()):
         say(
-            "the model was fitted to other sessions, and this one has reference frames of its own: `compensate anchor` "
-            "makes a model of them that leaves less here"
+            "the model was fitted to other sessions, and this one has reference frames of its own: "
+            "`compensate rereference` makes a model of them that leaves less here"
         )
 
 

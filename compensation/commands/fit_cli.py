@@ -1,4 +1,4 @@
-"""`compensate fit`, `anchor`, `report`, `datasheet` and `budget`: what sessions of one camera say."""
+"""`compensate fit`, `rereference`, `report`, `datasheet` and `budget`: what sessions of one camera say."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def fit(
 
 
 @app.command()
-def anchor(
+def rereference(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model file, as compensate fit writes it.")],
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session, with a few reference frames.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The model file (JSON) to write, for this session.")],
@@ -209,7 +209,7 @@ def anchor(
     Camera or target were taken out since the model was fitted: what that moved is the same in all states, and is taken
     out, with its uncertainty. The new model has the thermal form alone.
 
-    Example: compensate anchor model.json sessions/20260108T180000Z-short -o model-of-the-8th.json
+    Example: compensate rereference model.json sessions/20260108T180000Z-short -o model-of-the-8th.json
     """
     check_writable(out)
     known = thermal_of(load_model(model))

@@ -129,7 +129,7 @@ def anchored(model: DriftModel, observations: Observations, frames: Mask | None 
     thermal = thermal_of(model)
     check_same(thermal, observations)
     if observations.target.name != model.facts.target_name or len(observations.sessions) > 1:
-        raise SessionError(f"a model is anchored in one session of its target, {model.facts.target_name}")
+        raise SessionError(f"a model is rereferenced to one session of its target, {model.facts.target_name}")
     wanted = observations.of(Role.REFERENCE) if frames is None else frames & observations.usable
     states = frame_states(observations, thermal.memory)
     found = features(states, [term.feature for term in thermal.terms], thermal.origin) - thermal.reference_features
@@ -137,7 +137,7 @@ def anchored(model: DriftModel, observations: Observations, frames: Mask | None 
     known = wanted & np.isfinite(found).all(axis=1)
     rows = displacements_from(observations, known, thermal.facts.reference_centres_px)
     if len(rows.frame) == 0:
-        raise SessionError("the session has no usable reference frames of a known thermal state to anchor a model in")
+        raise SessionError("the session has no usable reference frames of a known thermal state to rereference to")
     away_px = float(np.linalg.norm(rows.displacement_px.mean(axis=0)))
     if away_px > _SAME_PLACE_PX:
         raise SessionError(
@@ -147,11 +147,11 @@ def anchored(model: DriftModel, observations: Observations, frames: Mask | None 
 
 
 def thermal_of(model: DriftModel) -> ThermalModel:
-    """The thermal form of a model, which alone can be anchored; SessionError when it has none."""
+    """The thermal form of a model, which alone can be rereferenced; SessionError when it has none."""
     for one in (model, model.other):
         if isinstance(one, ThermalModel):
             return one
-    raise SessionError("the model has no thermal form, which alone can be anchored in a session")
+    raise SessionError("the model has no thermal form, which alone can be rereferenced to a session")
 
 
 def _updated(model: ThermalModel, observations: Observations, rows: Displacements, found: Float) -> ThermalModel:

@@ -21,8 +21,8 @@ from thermostand.foundation.errors import DeviceError, Interrupted, SessionError
 from thermostand.foundation.events import (
     CAMERA_NOT_OPENED,
     GUARD,
-    HOUSE_NOT_ENDED,
-    HOUSE_NOT_RECORDED,
+    IDLE_LOG_NOT_ENDED,
+    IDLE_LOG_NOT_RECORDED,
     NOT_RESUMED,
     QUEUE,
     QUEUE_EMPTY,
@@ -351,7 +351,7 @@ class Daemon(Host):
         except (SessionError, OSError) as error:
             self.open_stand.recorder = None
             self._assembly.stand.safety.demand()
-            self._tell(HOUSE_NOT_RECORDED, str(error))
+            self._tell(IDLE_LOG_NOT_RECORDED, str(error))
 
     async def _hand_over(self) -> None:
         """The run records, and its session is known."""
@@ -368,7 +368,7 @@ class Daemon(Host):
         try:
             await self.record.end(FINISH_WITHIN_S)
         except (SessionError, OSError) as error:
-            self._tell(HOUSE_NOT_ENDED, str(error))
+            self._tell(IDLE_LOG_NOT_ENDED, str(error))
 
     async def _look_after(self) -> None:
         """Midnight, a record that has ended by itself, what is kept for the next start, and what systemd shows."""
@@ -412,14 +412,14 @@ class Daemon(Host):
         try:
             recorder = await self.record.begin()
         except (SessionError, OSError) as error:
-            self._tell(HOUSE_NOT_ENDED, f"today's record is not begun, yesterday's goes on: {error}")
+            self._tell(IDLE_LOG_NOT_ENDED, f"today's record is not begun, yesterday's goes on: {error}")
             return
         if self.open_stand.guest is None:
             self.open_stand.recorder = recorder
         try:
             await self.record.complete(FINISH_WITHIN_S)
         except (SessionError, OSError) as error:
-            self._tell(HOUSE_NOT_ENDED, str(error))
+            self._tell(IDLE_LOG_NOT_ENDED, str(error))
 
     async def _adopt_camera(self) -> None:
         """A camera that is found powered is opened; one that is off stays off until somebody wants it."""

@@ -1,4 +1,4 @@
-"""The daemon's own record between runs: one session a day, `20261122-house`, begun at local midnight.
+"""The daemon's own record between runs: one session a day, `20261122-idle-log`, begun at local midnight.
 
 What is done by hand is recorded as in a run, and heat depends on it in the same way. While a run records, the
 daemon does not, but for the moments in which one takes over from the other: each instant is in a session. Old ones are
@@ -36,7 +36,7 @@ from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
 from thermostand.stand.assembly import Assembly
 from thermostand.stand.running.session_files import info_of, recorder_in, tell_identities
 
-BETWEEN_RUNS = "house"  # in place of a recipe's name
+BETWEEN_RUNS = "idle-log"  # in place of a recipe's name
 _NAME = re.compile(rf"([0-9]{{8}})-{BETWEEN_RUNS}(-[0-9]+)?")
 
 

@@ -196,7 +196,7 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
     elsewhere = replace(thermal(), facts=facts)
     other = replace(paper(), facts=replace(paper().facts, session_ids=("another",)))
     save_model(replace(elsewhere, other=other), tmp_path / "elsewhere.json")
-    assert "thermal: " in run("anchor", tmp_path / "elsewhere.json", recorded.path, "-o", tmp_path / "here.json")
+    assert "thermal: " in run("rereference", tmp_path / "elsewhere.json", recorded.path, "-o", tmp_path / "here.json")
     here, observed = load_model(tmp_path / "here.json"), observe(recorded.path)
     assert (here.form, here.other) == ("thermal", None)
     states = frame_states(observed, here.memory)
@@ -207,8 +207,8 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
     place.write_text(f"x_px,y_px,time_ns\n100,200,{observed.time_ns[4]}\n")
     for name, is_offered in (("elsewhere", True), ("here", False)):
         said = run("apply", tmp_path / f"{name}.json", place, "--session", recorded.path, "-o", tmp_path / "out.csv")
-        assert ("`compensate anchor`" in said) == is_offered
-    refused = run("anchor", files["paper"], recorded.path, "-o", tmp_path / "none.json", status=1)
+        assert ("`compensate rereference`" in said) == is_offered
+    refused = run("rereference", files["paper"], recorded.path, "-o", tmp_path / "none.json", status=1)
     assert "no thermal form" in refused
     few = "fit", recorded.path, *2 * ["--like", files["thermal"]], "-o", tmp_path / "none.json"
     assert "3 units or more" in run(*few, status=1)

@@ -151,7 +151,7 @@ OF_A_SESSION = {
     "compensate validate": "-o v.html --camera nowhere --model nowhere",
     "compensate budget": "",
     "compensate apply": "nowhere -o p.csv",
-    "compensate anchor": "nowhere -o b.json",
+    "compensate rereference": "nowhere -o b.json",
 }
 
 

@@ -126,7 +126,7 @@ async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_ta
     for name in (names[1], names[3]):
         add_tags(tmp_path / name, ["keep"], "eva", 1)
     (tmp_path / names[3] / NOTES_NAME).write_bytes(b"a damaged line\n")
-    for name in ("20200101-overnight", "20200101-house"):  # a run's, and a folder that is no session
+    for name in ("20200101-overnight", "20200101-idle-log"):  # a run's, and a folder that is no session
         (tmp_path / name).mkdir()
     today = f"{datetime.fromtimestamp(clock.now_ns() / NS_PER_S):%Y%m%d}"
     assert remove_idle_logs(tmp_path, today, 30) == []
@@ -136,4 +136,4 @@ async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_ta
         await asyncio.sleep(0.01)
     assert next(event for event in said if event.kind == "idle_logs_removed").data["names"] == [names[0], names[2]]
     kept = sorted(path.name for path in tmp_path.iterdir())
-    assert kept == sorted(["20200101-house", "20200101-overnight", names[1], names[3], latest])
+    assert kept == sorted(["20200101-idle-log", "20200101-overnight", names[1], names[3], latest])

@@ -161,7 +161,7 @@ def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(s
     served.process.send_signal(signal.SIGTERM)
     reported = served.reported()
     assert served.process.returncode == 0, reported
-    (folder,) = served.out.glob("*-house*")  # all of a day is in one session
+    (folder,) = served.out.glob("*-idle-log*")  # all of a day is in one session
     session = Session.open(folder)
     assert session.incomplete == ()
     assert any(event.kind == "tokens_not_read" for event in session.events())
@@ -251,7 +251,7 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(
 ):
     served = serve()
     served.until(is_idle)
-    (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
+    (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-idle-log")]
     served.post("devices/regulator/set", arguments={"setpoint_degC": 30.0})
     served.until(lambda state: state.readings["relays.heater_enable"].value == 1)
     folder.rename(folder.with_name("elsewhere"))
@@ -302,7 +302,7 @@ def test_a_trip_that_somebody_has_heard_of_is_never_forgotten(laboratory: Path, 
         served = Served(laboratory, tmp_path / f"out-{kill}")
         try:
             served.until(is_idle)
-            (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-house")]
+            (folder,) = [path for path in served.out.iterdir() if path.name.endswith("-idle-log")]
             folder.rename(folder.with_name("elsewhere"))
             served.until(lambda state: state.fault is not None)
         finally:

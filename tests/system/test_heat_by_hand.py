@@ -59,7 +59,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
     # On a busy machine a poll may take longer than its period.
     assert {event.kind for event in reported if event.level != "info"} <= {"device_slow"}
     first, second = (
-        Session.open(out / f"{name}-house").readings("regulator.pv")[0] for name in ("20261122", "20261123")
+        Session.open(out / f"{name}-idle-log").readings("regulator.pv")[0] for name in ("20261122", "20261123")
     )
     assert len(first) > 0
     assert len(second) > 0
