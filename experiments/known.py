@@ -36,7 +36,7 @@ class Visit:
     """A decision: a set-point that is new, and for how long it is held."""
 
     chamber_degC: float
-    dwell_s: float
+    soak_s: float
 
 
 class Enough:
@@ -54,7 +54,7 @@ def first_decision(
     known: Known,
     set_points_degC: Sequence[float],
     held_out_degC: Sequence[float],
-    dwell_s: float,
+    soak_s: float,
     frames: int,
     taken: CaptureParameters,
 ) -> Decide:
@@ -63,11 +63,11 @@ def first_decision(
         set_points_degC=tuple(set_points_degC),
         held_out_degC=tuple(held_out_degC),
         unvalidated_degC=tuple(dict.fromkeys(held_out_degC)),
-        dwell_s=dwell_s,
+        soak_s=soak_s,
         residual_px=known.residual_px,
         coldest_degC=min(set_points_degC),
         warmest_degC=max(set_points_degC),
-        dwells_s=tuple(sorted(known.dwells_s)),
+        soaks_s=tuple(sorted(known.soaks_s)),
         ramp_K_per_min=known.ramp_K_per_min,
         states=known.states,
         left_s=0.0,
@@ -82,7 +82,7 @@ def first_decision(
 
 def fixed_visits(decide: Decide) -> tuple[Step, ...]:
     """What follows a `Decide` in the plan: the visits that are made when nothing is decided."""
-    return tuple(step for degC in decide.set_points_degC for step in _visit(decide, degC, decide.dwell_s))
+    return tuple(step for degC in decide.set_points_degC for step in _visit(decide, degC, decide.soak_s))
 
 
 def after_decision(decide: Decide, answer: Answer) -> tuple[Step, ...]:
@@ -92,15 +92,15 @@ def after_decision(decide: Decide, answer: Answer) -> tuple[Step, ...]:
             return _validations(decide, decide.unvalidated_degC)
         case Undecided():
             first, rest = decide.set_points_degC[:1], decide.set_points_degC[1:]
-            steps = tuple(step for degC in first for step in _visit(decide, degC, decide.dwell_s))
+            steps = tuple(step for degC in first for step in _visit(decide, degC, decide.soak_s))
             unvalidated = tuple(degC for degC in decide.unvalidated_degC if degC not in first)
             left = replace(decide, set_points_degC=rest, unvalidated_degC=unvalidated)
             return _continued(left, steps) if first else ()
-        case Visit(chamber_degC, dwell_s):
+        case Visit(chamber_degC, soak_s):
             visits = decide.visits + 1
             count = 1 if visits % _VALIDATED_AFTER == 0 else 0
             now, later = decide.unvalidated_degC[:count], decide.unvalidated_degC[count:]
-            steps = (*_visit(decide, chamber_degC, dwell_s), *_validations(decide, now))
+            steps = (*_visit(decide, chamber_degC, soak_s), *_validations(decide, now))
             return _continued(replace(decide, visits=visits, unvalidated_degC=later), steps)
 
 
@@ -108,25 +108,25 @@ def _continued(decide: Decide, steps: tuple[Step, ...]) -> tuple[Step, ...]:
     """These steps, then the next decision and the fixed visits for which there is time behind them."""
     left_s = max(0.0, decide.left_s - usual_s(steps))
     validations = _validations(decide, decide.unvalidated_degC)
-    longest_s = usual_s(_visit(decide, decide.warmest_degC, max(decide.dwells_s)))
+    longest_s = usual_s(_visit(decide, decide.warmest_degC, max(decide.soaks_s)))
     if left_s < usual_s(validations) + longest_s:
         return (*steps, *validations)
-    fixed = round(left_s / usual_s(_visit(decide, decide.warmest_degC, decide.dwell_s)))
+    fixed = round(left_s / usual_s(_visit(decide, decide.warmest_degC, decide.soak_s)))
     kept = decide.set_points_degC[max(0, len(decide.set_points_degC) - fixed) :]
     following = replace(decide, set_points_degC=kept, left_s=left_s)
     return (*steps, following, *fixed_visits(following))
 
 
 def _validations(decide: Decide, degC: Sequence[float]) -> tuple[Step, ...]:
-    dwell_s = decide.dwells_s[len(decide.dwells_s) // 2]
-    return tuple(step for each in degC for step in _visit(decide, each, dwell_s))
+    soak_s = decide.soaks_s[len(decide.soaks_s) // 2]
+    return tuple(step for each in degC for step in _visit(decide, each, soak_s))
 
 
-def _visit(decide: Decide, chamber_degC: float, dwell_s: float) -> tuple[Step, ...]:
+def _visit(decide: Decide, chamber_degC: float, soak_s: float) -> tuple[Step, ...]:
     role = Role.VALIDATION if chamber_degC in decide.held_out_degC else Role.FIT
     return (
         SetTemperature(chamber_degC),
-        Soak(dwell_s),
+        Soak(soak_s),
         OpenFlap(),
         Capture(decide.frames, decide.interval_s, decide.exposure_s, role, chamber_degC),
         CloseFlap(),

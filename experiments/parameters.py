@@ -81,15 +81,15 @@ class Known(Document):
     residual_px: float = Field(default=0.005, gt=0, le=10)
     # Longer ones (1500 to 5400 s) were better at rest after 45 %, but so few set-points were visited that a cycle never
     # ended.
-    dwells_s: tuple[Wait_s, ...] = Field(default=(900.0, 1500.0, 2700.0), min_length=1, max_length=5)
+    soaks_s: tuple[Wait_s, ...] = Field(default=(900.0, 1500.0, 2700.0), min_length=1, max_length=5)
     ramp_K_per_min: float = Field(default=2.0, gt=0, le=20)
     states: tuple[WantedState, ...] = Field(default=WANTED_STATES, min_length=1, max_length=2)
     wait_s: float = Field(default=120.0, ge=5, le=3600)
 
     @model_validator(mode="after")
     def _dwells(self) -> Self:
-        if min(self.dwells_s) < _SHORTEST_DWELL_s:
-            raise ValueError(f"dwells_s has {min(self.dwells_s)}; a visit takes at least {_SHORTEST_DWELL_s:g} s")
+        if min(self.soaks_s) < _SHORTEST_DWELL_s:
+            raise ValueError(f"soaks_s has {min(self.soaks_s)}; a visit takes at least {_SHORTEST_DWELL_s:g} s")
         return self
 
 
@@ -138,11 +138,11 @@ UntilSettledOrKnown = Annotated[
 ]
 
 
-def check_until(until: Settled | None, dwell_s: float, name: str = "dwell_s") -> None:
-    """ValueError when a dwell of at most `dwell_s`, by that name, leaves no time to see that the camera has settled."""
-    if until is not None and dwell_s < max(until.min_s, until.window_s):
+def check_until(until: Settled | None, soak_s: float, name: str = "soak_s") -> None:
+    """ValueError when a dwell of at most `soak_s`, by that name, leaves no time to see that the camera has settled."""
+    if until is not None and soak_s < max(until.min_s, until.window_s):
         raise ValueError(
-            f"{name} {dwell_s} is the longest dwell; it must be at least until's min_s {until.min_s} "
+            f"{name} {soak_s} is the longest dwell; it must be at least until's min_s {until.min_s} "
             f"and window_s {until.window_s}"
         )
 

@@ -33,11 +33,11 @@ def soak(duration_s: float, how: Guaranteed) -> Soak:
     return Soak(duration_s, band_K=how.band_K, unsettled=how.unsettled)
 
 
-def dwell(dwell_s: float, until: Settled | None, how: Guaranteed, exposure_s: float, chamber_degC: float) -> AnySoak:
-    """The soak at a set-point: `dwell_s`, or at most that."""
+def dwell(soak_s: float, until: Settled | None, how: Guaranteed, exposure_s: float, chamber_degC: float) -> AnySoak:
+    """The soak at a set-point: `soak_s`, or at most that."""
     if until is None:
-        return soak(dwell_s, how)
-    return SoakUntilSettled.until(dwell_s, until, exposure_s, chamber_degC)
+        return soak(soak_s, how)
+    return SoakUntilSettled.until(soak_s, until, exposure_s, chamber_degC)
 
 
 def placed(table_position: Mapping[str, float]) -> Iterator[Step]:

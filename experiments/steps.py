@@ -876,12 +876,12 @@ _DECIDE_S = 10.0
 @dataclass(frozen=True, slots=True)
 class Decide(Step):
     """Ask what to visit next, or whether enough is known: the answer replaces what is left of its cycle, which are
-    visits of `set_points_degC` for `dwell_s` each (experiments/known.py).
+    visits of `set_points_degC` for `soak_s` each (experiments/known.py).
 
     Wanted is a predicted residual of `residual_px` from `coldest_degC` to `warmest_degC`, over `states`: of a camera
     `at_rest`, 4 h after a change, or `on_the_way`, 45 min after it. No temperature outside is visited, none of
     `held_out_degC` is shown to the fitter; of these `unvalidated_degC` have not been visited yet.
-    `dwells_s`: to choose from. `ramp_K_per_min`: of the chamber, at most. `left_s`: of the fixed cycle's time.
+    `soaks_s`: to choose from. `ramp_K_per_min`: of the chamber, at most. `left_s`: of the fixed cycle's time.
     `visits`: that were decided so far. `wait_s`: for an answer, in real time; without one the fixed visits go on.
     `frames`, `interval_s`, `exposure_s`: of a visit.
     """
@@ -890,11 +890,11 @@ class Decide(Step):
     is_setup = False
     in_recipes = False
     ends_when_skipped = True
-    dwell_s: float
+    soak_s: float
     residual_px: float
     coldest_degC: float
     warmest_degC: float
-    dwells_s: tuple[float, ...]
+    soaks_s: tuple[float, ...]
     ramp_K_per_min: float
     left_s: Annotated[float, _BY_THE_PLAN]
     visits: Annotated[int, _BY_THE_PLAN]

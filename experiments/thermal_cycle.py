@@ -3,7 +3,7 @@
 The camera is powered throughout and first comes to equilibrium at the reference temperature. The flap is closed but
 for the captures. Set-points listed as held out are recorded for validation and never shown to the fitter.
 
-With `until: settled` a dwell ends when the camera has settled, at the latest after `dwell_s`; the flap then opens for
+With `until: settled` a dwell ends when the camera has settled, at the latest after `soak_s`; the flap then opens for
 short looks at the target too.
 
 With `until: known` (experimental) the visits are decided one after the other, and the cycle ends when enough is known
@@ -41,7 +41,7 @@ class ThermalCycle(StillTable, Guaranteed):
     held_out_degC: tuple[Chamber_degC, ...] = Field(default=(), max_length=1000)
     # The paper's 45 min (section 3.2). On drawn cameras (60 to 69) dwells of 29 min leave 0.85 times as much 90 min
     # after a change in the median and 1.8 times in the worst case, but 1.5 and 2.3 times 4 h after it.
-    dwell_s: Wait_s = 2700.0
+    soak_s: Wait_s = 2700.0
     until: UntilSettledOrKnown = None
     cycles: int = Field(default=1, ge=1, le=100)
     reference_frames: FrameCount = 20
@@ -57,7 +57,7 @@ class ThermalCycle(StillTable, Guaranteed):
         if isinstance(self.until, Known) and (self.band_K, self.unsettled) != (SOAK_BAND_K, "mark"):
             raise ValueError("band_K and unsettled are not for until: known, whose soaks have the usual band")
         if not isinstance(self.until, Known):
-            check_until(self.until, self.dwell_s)
+            check_until(self.until, self.soak_s)
         elif self.visits > MOST_VISITS:
             raise ValueError(f"until: known is for cycles of at most {MOST_VISITS} visits, this one has {self.visits}")
         elif min(self.set_points_degC) == max(self.set_points_degC):
@@ -83,7 +83,7 @@ def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     for _ in range(parameters.cycles):
         for chamber_degC in parameters.set_points_degC:
             yield SetTemperature(chamber_degC)
-            yield dwell(parameters.dwell_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
+            yield dwell(parameters.soak_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
             role = Role.VALIDATION if chamber_degC in parameters.held_out_degC else Role.FIT
             yield from frames_through_flap(parameters, parameters.frames_per_point, role, chamber_degC)
     yield StopChamber()
@@ -94,7 +94,7 @@ def _deciding(parameters: ThermalCycle, known: Known) -> Iterator[Step]:
         known,
         parameters.set_points_degC * parameters.cycles,
         parameters.held_out_degC,
-        parameters.dwell_s,
+        parameters.soak_s,
         parameters.frames_per_point,
         parameters,
     )

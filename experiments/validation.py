@@ -3,7 +3,7 @@
 The first temperature is the reference: what the table does to the target is known from there. The paper counts 12
 temperatures in its text and shows 11 deviations from the reference. At each temperature the target goes back to V0
 at the end; how far it is then from where it was is the table's own share of the deviations. With `until: settled` a
-dwell ends when the camera, which sees the target at V0 meanwhile, has settled, at the latest after `dwell_s`.
+dwell ends when the camera, which sees the target at V0 meanwhile, has settled, at the latest after `soak_s`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Validation(MovingTable, Guaranteed):
     temperatures_degC: tuple[Chamber_degC, ...] = Field(min_length=2, max_length=100)
     positions: tuple[TablePosition, ...] = Field(min_length=2, max_length=100)
     equilibrium_s: Wait_s = 2700.0
-    dwell_s: Wait_s = 2700.0
+    soak_s: Wait_s = 2700.0
     until: Until = None
     reference_frames: FrameCount = 20
     check_home_every: int = Field(default=3, ge=1, le=100)
@@ -47,7 +47,7 @@ class Validation(MovingTable, Guaranteed):
             raise ValueError("temperatures_degC has the same temperature twice")
         if len(set(self.positions)) < len(self.positions):
             raise ValueError("positions has the same position twice; going back to the first is in the plan already")
-        check_until(self.until, self.dwell_s)
+        check_until(self.until, self.soak_s)
         return self
 
     @property
@@ -69,7 +69,7 @@ def validation(parameters: Validation) -> Iterator[Step]:
         if number % parameters.check_home_every == 0:
             yield from homes_checked()
         yield SetTemperature(chamber_degC)
-        yield dwell(parameters.dwell_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
+        yield dwell(parameters.soak_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
         yield from _poses(parameters, chamber_degC, parameters.frames_per_position)
     yield from homes_checked()
     yield StopChamber()

@@ -153,12 +153,10 @@ def _states(memory: ThermalMemory, values: Sequence[Float]) -> States:
     return States(memory, np.column_stack([*values, *np.full((2, len(values[0])), np.inf)]))
 
 
-def after(
-    around: CameraSurroundings, situation: ForecastState, set_points_degC: Float, dwell_s: Float
-) -> ForecastState:
+def after(around: CameraSurroundings, situation: ForecastState, set_points_degC: Float, soak_s: Float) -> ForecastState:
     """After dwells (S,) at set-points (S,), s and degC."""
     goal, memory = around.air_degC(set_points_degC), situation.states.memory
-    left_s = np.asarray(dwell_s, np.float64).copy()
+    left_s = np.asarray(soak_s, np.float64).copy()
     target, air, values = situation.target_degC, situation.air_degC, [*situation.states.columns]
     of_air, of_model = Follower(_AIR_LAGS), Follower(memory.parts)
     lags = [*situation.camera_lags.T]
@@ -227,7 +225,7 @@ class BestCourse:
     """The first visit of a course. variance_px2: of the model after all of it, mean over the wanted states."""
 
     chamber_degC: float
-    dwell_s: float
+    soak_s: float
     variance_px2: float
 
 
@@ -236,7 +234,7 @@ def best_course(
     here: ForecastState,
     around: CameraSurroundings,
     grid_degC: Float,
-    dwells_s: Sequence[float],
+    soaks_s: Sequence[float],
     seed: int,
 ) -> BestCourse:
     """Of courses of each dwell, about as long together: the one after which the mean variance over the wanted states is
@@ -244,11 +242,11 @@ def best_course(
     rng = np.random.default_rng([20, seed])
     moment = known.wanted.T @ known.wanted / len(known.wanted)
     best: BestCourse | None = None
-    for dwell_s in dwells_s:
-        set_points = _drawn(grid_degC, max(1, round(_HORIZON_S / dwell_s)), rng)
-        variance_px2 = _after_courses(known, here, around, set_points, dwell_s, moment)
+    for soak_s in soaks_s:
+        set_points = _drawn(grid_degC, max(1, round(_HORIZON_S / soak_s)), rng)
+        variance_px2 = _after_courses(known, here, around, set_points, soak_s, moment)
         first = int(np.argmin(variance_px2))
-        found = BestCourse(float(set_points[first, 0]), dwell_s, float(variance_px2[first]))
+        found = BestCourse(float(set_points[first, 0]), soak_s, float(variance_px2[first]))
         best = found if best is None or found.variance_px2 < best.variance_px2 else best
     if best is None:
         raise ValueError("there is no dwell to choose from")
@@ -260,7 +258,7 @@ def _after_courses(
     here: ForecastState,
     around: CameraSurroundings,
     set_points: Float,
-    dwell_s: float,
+    soak_s: float,
     moment: Float,
 ) -> Float:
     """(S,), px^2: the variance after each course (S, visits); the covariance of each is updated visit by visit (the
@@ -269,7 +267,7 @@ def _after_courses(
     at = here.where(np.zeros(count, np.int64))
     covariance = np.repeat(known.covariance[None], count, axis=0)
     for visit in set_points.T:
-        at = after(around, at, visit, np.full(count, dwell_s))
+        at = after(around, at, visit, np.full(count, soak_s))
         own = known.features(at)
         gain = np.einsum("skl,sl->sk", covariance, own)
         total = known.noise_px2 + (gain * own).sum(axis=1)
@@ -335,25 +333,25 @@ _UNCHECKED = "what the model leaves between set-points is seen at three of them"
 class Wanted:
     """What a night is for, and within what it decides. range_degC: set-points at which the model is wanted; none
     outside is chosen, nor one of held_out_degC. residual_px: the predicted residual with which the night is content.
-    dwells_s: to choose from. ramp_K_per_min: of the chamber, at most. states: in which the model is wanted there, see
+    soaks_s: to choose from. ramp_K_per_min: of the chamber, at most. states: in which the model is wanted there, see
     wanted_states."""
 
     range_degC: tuple[float, float]
     residual_px: float
     held_out_degC: tuple[float, ...] = ()
-    dwells_s: tuple[float, ...] = (900.0, 1500.0, 2700.0)
+    soaks_s: tuple[float, ...] = (900.0, 1500.0, 2700.0)
     ramp_K_per_min: float = 2.0
     states: tuple[WantedState, ...] = WANTED_STATES
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """kind: "visit" or "enough". chamber_degC, dwell_s: of the visit. predicted_px: the residual that the model
+    """kind: "visit" or "enough". chamber_degC, soak_s: of the visit. predicted_px: the residual that the model
     predicts over the wanted states, RMS of a coordinate, NaN where that was not asked. reason: in words."""
 
     kind: Literal["visit", "enough"]
     chamber_degC: float
-    dwell_s: float
+    soak_s: float
     predicted_px: float
     reason: str
 
@@ -380,12 +378,12 @@ def decide(observations: Observations, wanted: Wanted) -> Decision:
         lambda situation: _features(model, situation),
     )
     seed = int(observations.time_ns[-1] % (1 << 32))
-    course = best_course(known, now(observations, model.memory), around, grid, wanted.dwells_s, seed)
+    course = best_course(known, now(observations, model.memory), around, grid, wanted.soaks_s, seed)
     reason = (
         f"the residual is predicted at {1e3 * predicted_px:.1f} mpx; {course.chamber_degC:g} degC for "
-        f"{course.dwell_s / 60:g} min begins the course that lowers it most"
+        f"{course.soak_s / 60:g} min begins the course that lowers it most"
     )
-    return Decision("visit", course.chamber_degC, course.dwell_s, predicted_px, reason)
+    return Decision("visit", course.chamber_degC, course.soak_s, predicted_px, reason)
 
 
 def predicted_residual_px(model: ThermalModel, asked: ForecastState) -> float:
@@ -424,8 +422,8 @@ def _seen_degC(observations: Observations) -> Float:
 def _furthest(observations: Observations, wanted: Wanted, grid: Float, why: str) -> Decision:
     seen = _seen_degC(observations)
     distance_K = np.abs(grid[:, None] - seen).min(axis=1, initial=np.inf)
-    degC, dwell_s = float(grid[np.argmax(distance_K)]), max(wanted.dwells_s)
-    return Decision("visit", degC, dwell_s, math.nan, f"{why}; {degC:g} degC is furthest from the others")
+    degC, soak_s = float(grid[np.argmax(distance_K)]), max(wanted.soaks_s)
+    return Decision("visit", degC, soak_s, math.nan, f"{why}; {degC:g} degC is furthest from the others")
 
 
 def _features(model: ThermalModel, situation: ForecastState) -> Float:

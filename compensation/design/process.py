@@ -15,7 +15,7 @@ LEFT_NAME = "stand-known-left"  # of a process whose daemon has gone
 
 def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     """The decision about a session that is being recorded. asked: the parameters of the plan's step. kind: "visit",
-    with chamber_degC and dwell_s, "enough", or "none", when the frames so far allow no decision; reason: in words.
+    with chamber_degC and soak_s, "enough", or "none", when the frames so far allow no decision; reason: in words.
     Plain values: the daemon that reads them has nothing of this package."""
     import cv2
 
@@ -27,7 +27,7 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
         (asked["coldest_degC"], asked["warmest_degC"]),
         asked["residual_px"],
         tuple(asked.get("held_out_degC", ())),
-        tuple(asked["dwells_s"]),
+        tuple(asked["soaks_s"]),
         asked["ramp_K_per_min"],
         tuple(asked.get("states", WANTED_STATES)),
     )
@@ -41,7 +41,7 @@ def decided(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
         "kind": found.kind,
         "reason": found.reason,
         "chamber_degC": float(found.chamber_degC),
-        "dwell_s": float(found.dwell_s),
+        "soak_s": float(found.soak_s),
     }
 
 

@@ -31,7 +31,7 @@ class Eta:
     a single delay, such as a pause that was not announced, changes nothing. Steps before the running one are never
     waited for.
 
-    Of a run that is resumed after an interruption, `done` are the ids of steps that are done, `earned_s` what others
+    Of a run that is resumed after an interruption, `done` are the ids of steps that are done, `soaked_s` what others
     have earned of what is stated, by their ids. `after_s`: what follows the last step, the way back to the laboratory's
     temperature.
     """
@@ -40,11 +40,11 @@ class Eta:
         self,
         steps: Sequence[PricedStep],
         done: Collection[str] = (),
-        earned_s: Mapping[str, float] = MappingProxyType({}),
+        soaked_s: Mapping[str, float] = MappingProxyType({}),
         after_s: float = 0.0,
     ) -> None:
         self._expected_s = {step.planned.step_id: step.duration_s for step in steps}  # with what it has earned
-        self._steps = [_owed(step, earned_s.get(step.planned.step_id, 0.0)) for step in steps]
+        self._steps = [_owed(step, soaked_s.get(step.planned.step_id, 0.0)) for step in steps]
         self._waiting = {step.planned.index: step for step in self._steps if step.planned.step_id not in done}
         self._first = min(self._waiting, default=0)
         self._stated_s = sum(step.stated_s for step in self._waiting.values())
@@ -209,6 +209,6 @@ class Eta:
         return (now_ns - self._begun_ns - held_ns) / NS_PER_S
 
 
-def _owed(step: PricedStep, earned_s: float) -> PricedStep:
-    earned_s = min(earned_s, step.stated_s)
-    return replace(step, stated_s=step.stated_s - earned_s, duration_s=step.duration_s - earned_s)
+def _owed(step: PricedStep, soaked_s: float) -> PricedStep:
+    soaked_s = min(soaked_s, step.stated_s)
+    return replace(step, stated_s=step.stated_s - soaked_s, duration_s=step.duration_s - soaked_s)

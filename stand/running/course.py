@@ -193,7 +193,7 @@ class Course:
             text=step.words,
             standing=standing,
             duration_s=self.board.eta.expected_s(step_id),
-            earned_s=state.earned_ns.get(step_id, 0) / NS_PER_S,
+            soaked_s=state.earned_ns.get(step_id, 0) / NS_PER_S,
             frames=frames,
             frames_saved=frames if standing == "done" else state.frames.get(step_id, 0),
             began_ns=self._began_ns.get(step_id),

@@ -85,7 +85,7 @@ class StatusBoard:
     ) -> None:
         self._recipe = recipe
         self._soaked_again_s = soaked_again_s
-        self.eta = Eta(night.steps, state.done, state.earned_s, night.after_s)
+        self.eta = Eta(night.steps, state.done, state.soaked_s, night.after_s)
         self._gate = gate
         self._stop = stop
         self._latch = latch

@@ -125,7 +125,7 @@ class PromptState(Value):
 class PlanStep(Value):
     """A step of the plan in force. kind, parameters: as in a recipe's `steps`; text: the same in words.
 
-    duration_s: expected in all. earned_s: of a soak so far. frames, frames_saved: of a capture. began_ns, ended_ns:
+    duration_s: expected in all. soaked_s: of a soak so far. frames, frames_saved: of a capture. began_ns, ended_ns:
     when it was begun and done by this daemon, None for what is not known. expected_ns: when a step to come, or under
     way, is expected to end, None when that is not known.
     """
@@ -137,7 +137,7 @@ class PlanStep(Value):
     text: str
     standing: StepStanding
     duration_s: float
-    earned_s: float = 0.0
+    soaked_s: float = 0.0
     frames: int = 0
     frames_saved: int = 0
     began_ns: int | None = None

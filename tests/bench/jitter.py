@@ -37,7 +37,7 @@ experiments:
   - thermal_cycle:
       equilibrium_s: 1
       set_points_degC: [24]
-      dwell_s: 1
+      soak_s: 1
       reference_frames: {FRAMES}
       interval_s: {INTERVAL_s}
 """

@@ -112,8 +112,8 @@ def outcome_of(seed: int) -> Outcome:
     return Outcome(100 * gone_s / whole_s, 100 * as_good_s / whole_s, fixed, _left(made, asked))
 
 
-def _asked_night(camera: Camera, way_degC: Sequence[int], dwell_s: int, seed: int) -> Night:
-    visits = [Stretch(float(degC), dwell_s, "validation", 5) for degC in way_degC]
+def _asked_night(camera: Camera, way_degC: Sequence[int], soak_s: int, seed: int) -> Night:
+    visits = [Stretch(float(degC), soak_s, "validation", 5) for degC in way_degC]
     return night(camera, [*warm_up(), *reference(), *visits], seed)
 
 
@@ -136,25 +136,25 @@ def deciding_night(
     """How long the cycle took, s, when it was as good as the fixed one, s, and the night."""
     known = Known(residual_px=residual_px)
     steps: list[Step] = [first_decision(known, WAY_DEGC, HELD_OUT_DEGC, DWELL_S, 5, CaptureParameters())]
-    parts, gone_s, as_good_s, degC, dwell_s = [*warm_up(), *reference()], 0.0, np.inf, 24.0, 0.0
+    parts, gone_s, as_good_s, degC, soak_s = [*warm_up(), *reference()], 0.0, np.inf, 24.0, 0.0
     begin = len(parts)
     steps += fixed_visits(steps[0]) if isinstance(steps[0], Decide) else ()
     while steps:
         match step := steps.pop(0):
             case SetTemperature(degC):
                 pass
-            case Soak(dwell_s):
+            case Soak(soak_s):
                 pass
             case Capture(frames, _, _, role):
-                parts.append(Stretch(degC, round(dwell_s), str(role), frames))
+                parts.append(Stretch(degC, round(soak_s), str(role), frames))
             case Decide():
                 made = night(camera, parts, seed)
                 visits = len(parts) - begin
                 if as_good_s == np.inf and visits > 5 and visits % _LOOKED_AT_EVERY == 0:
                     as_good_s = gone_s if left_mpx(made, asked) <= fixed_mpx else np.inf
-                wanted = Wanted(_RANGE_DEGC, residual_px, HELD_OUT_DEGC, step.dwells_s, step.ramp_K_per_min)
+                wanted = Wanted(_RANGE_DEGC, residual_px, HELD_OUT_DEGC, step.soaks_s, step.ramp_K_per_min)
                 found = decide(made.observed, wanted)
-                answer = Enough() if found.kind == "enough" else Visit(found.chamber_degC, found.dwell_s)
+                answer = Enough() if found.kind == "enough" else Visit(found.chamber_degC, found.soak_s)
                 steps = list(after_decision(step, answer))
                 continue
             case _:

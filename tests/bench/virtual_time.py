@@ -28,7 +28,7 @@ STEP_s = 5.0  # the shortest poll period of configs/simulated.yaml: every device
 RECIPE = f"""
 name: bench
 experiments:
-  - thermal_cycle: {{equilibrium_s: {SOAK_s}, set_points_degC: [30], dwell_s: {SOAK_s}, reference_frames: 1}}
+  - thermal_cycle: {{equilibrium_s: {SOAK_s}, set_points_degC: [30], soak_s: {SOAK_s}, reference_frames: 1}}
 """
 
 

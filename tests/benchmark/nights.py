@@ -86,9 +86,9 @@ def case(group: str, number: int, learned_from: str = TRAININGS[0]) -> Case:
     )
 
 
-def _drive(way_degC: tuple[int, ...], dwell_s: int) -> list[Stretch]:
+def _drive(way_degC: tuple[int, ...], soak_s: int) -> list[Stretch]:
     """Set-points that are left before the camera has settled; a frame every two minutes."""
-    return [Stretch(float(degC), 60, "validation", dwell_s // 120, 120.0) for degC in way_degC]
+    return [Stretch(float(degC), 60, "validation", soak_s // 120, 120.0) for degC in way_degC]
 
 
 def _question(task: str, made: Night, known: Observations, role: str, at_reference: Float) -> Question:

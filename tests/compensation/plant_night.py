@@ -59,11 +59,11 @@ class WarmUp:
 
 @dataclass(frozen=True)
 class Dwell:
-    """A set-point, `dwell_s`, then `frames` of one role half a second apart."""
+    """A set-point, `soak_s`, then `frames` of one role half a second apart."""
 
     chamber_degC: float
     role: str
-    dwell_s: int = 2700
+    soak_s: int = 2700
     frames: int = 5
 
 
@@ -143,7 +143,7 @@ class Night:
         """One part of the night."""
         self._target_degC = part.chamber_degC
         if isinstance(part, Dwell):
-            self.wait(part.dwell_s)
+            self.wait(part.soak_s)
             self.take(part.role, part.chamber_degC, part.frames, 0.5)
             return
         self.switch(False)

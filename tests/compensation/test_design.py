@@ -124,7 +124,7 @@ def test_decisions_are_the_same_for_the_same_frames_and_stay_within_what_is_want
     assert decided.kind == "visit"
     assert 10.0 <= decided.chamber_degC <= 52.0
     assert min(abs(decided.chamber_degC - degC) for degC in WANTED.held_out_degC) >= 1.0
-    assert decided.dwell_s in WANTED.dwells_s
+    assert decided.soak_s in WANTED.soaks_s
 
 
 def test_before_there_is_a_model_what_is_furthest_is_visited(observed: Observations):

@@ -97,7 +97,7 @@ def test_any_validation_ends_each_temperature_where_it_began(given_parameters: d
     assert len(taken) == parameters.visits == len(parameters.temperatures_degC) * (len(parameters.positions) + 1)
     assert tuple(dict.fromkeys(step.chamber_degC for step in taken)) == parameters.temperatures_degC
     set_points = [index for index, step in enumerate(steps) if isinstance(step, SetTemperature)]
-    assert [steps[index + 1] for index in set_points] == [Soak(parameters.dwell_s)] * len(set_points)
+    assert [steps[index + 1] for index in set_points] == [Soak(parameters.soak_s)] * len(set_points)
     checks = sum(isinstance(step, CheckHome) for step in steps)
     assert checks == 2 * (2 + (len(parameters.temperatures_degC) - 1) // parameters.check_home_every)
 

@@ -57,7 +57,7 @@ def test_each_dwell_follows_its_set_point():
     steps = list(thermal_cycle(CYCLE))
     for before, after in itertools.pairwise(steps):
         if isinstance(before, SetTemperature):
-            assert after == Soak(CYCLE.dwell_s)
+            assert after == Soak(CYCLE.soak_s)
 
 
 UNTIL_SETTLED = SoakUntilSettled(2700.0, 600.0, 600.0, 120.0, 0.2, 0.003, 0.1, 34.0)
@@ -65,7 +65,7 @@ UNTIL_SETTLED = SoakUntilSettled(2700.0, 600.0, 600.0, 120.0, 0.2, 0.003, 0.1, 3
 
 def test_a_dwell_until_settled_takes_the_place_of_the_fixed_one_at_its_set_point():
     """The equilibrium, which everything is measured against, stays as it is."""
-    cycle = {"set_points_degC": [34], "equilibrium_s": 3000, "dwell_s": 2700}
+    cycle = {"set_points_degC": [34], "equilibrium_s": 3000, "soak_s": 2700}
     fixed = list(thermal_cycle(ThermalCycle.model_validate(cycle)))
     adaptive = list(thermal_cycle(ThermalCycle.model_validate({**cycle, "until": "settled"})))
     assert adaptive == [UNTIL_SETTLED if step == Soak(2700.0) else step for step in fixed]
@@ -88,7 +88,7 @@ def test_a_validation_waits_for_the_camera_too():
         ({"until": {"min_s": 900}}, "until takes `settled`"),
         ({"until": {"settled": {"drift": 1}}}, "Extra inputs"),
         ({"until": {"settled": {"window_s": 300}}}, "window_s 300.0 holds less than four looks every 120.0 s"),
-        ({"until": "settled", "dwell_s": 500}, "dwell_s 500.0 is the longest dwell; it must be at least"),
+        ({"until": "settled", "soak_s": 500}, "soak_s 500.0 is the longest dwell; it must be at least"),
     ],
 )
 def test_thresholds_that_cannot_be_are_refused(entries: dict[str, object], message: str):
@@ -128,10 +128,10 @@ def test_a_capture_lasts_from_its_first_to_its_last_frame():
         ({"held_out_degC": (40.0,)}, "never visits"),
         ({"held_out_degC": (24.0,)}, "reference"),
         ({"interval_s": 0.05}, "does not fit"),
-        ({"dwell_minutes": 45}, "Extra inputs"),
+        ({"soak_minutes": 45}, "Extra inputs"),
         ({"set_points_degC": (71.0,)}, "less than or equal to 70"),
         ({"set_points_degC": (34.0,) * 1001}, "at most 1000 items"),
-        ({"dwell_s": 604801}, "less than or equal to 604800"),
+        ({"soak_s": 604801}, "less than or equal to 604800"),
         ({"equilibrium_s": 604801}, "less than or equal to 604800"),
         ({"cycles": 101}, "less than or equal to 100"),
         ({"frames_per_point": 1_000_001}, "less than or equal to 1000000"),
@@ -150,7 +150,7 @@ def test_impossible_parameters_are_refused_with_a_reason(change: dict[str, objec
         ({"cool_down_max_s": 604801}, "less than or equal to 604800"),
         ({"frames": 1_000_001}, "less than or equal to 1000000"),
         ({"interval_s": 0.05}, "does not fit"),
-        ({"dwell_s": 5}, "Extra inputs"),
+        ({"soak_s": 5}, "Extra inputs"),
     ],
 )
 def test_an_impossible_warm_up_is_refused_with_a_reason(change: dict[str, object], sentence: str):

@@ -57,7 +57,7 @@ def items(second):
     remark = "slow" if second % 2 else ""
     yield Batch("camera", time_ns, (Reading("camera.temperature", 40 + second / 8, "degC", time_ns, reason=remark),))
     yield frame(second)
-    yield StepMark(time_ns, f"soak-{second}", second, "soak", StepState.DONE, {"dwell_s": 2700.0})
+    yield StepMark(time_ns, f"soak-{second}", second, "soak", StepState.DONE, {"soak_s": 2700.0})
     yield Event(time_ns, "info", "note", f"second {second}")
 
 

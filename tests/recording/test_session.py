@@ -42,7 +42,7 @@ def telemetry_of(second):
 
 
 def mark(second):
-    return StepMark(START_NS + second * NS_PER_S, f"soak-{second}", second, "soak", StepState.DONE, {"dwell_s": 2700.0})
+    return StepMark(START_NS + second * NS_PER_S, f"soak-{second}", second, "soak", StepState.DONE, {"soak_s": 2700.0})
 
 
 def event(second):

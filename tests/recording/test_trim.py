@@ -66,7 +66,7 @@ def soak(time_ns, index):
     yield from (item for item in half_second(time_ns, index) if not isinstance(item, StepMark))
     if index in (1, 4):
         state = StepState.STARTED if index == 1 else StepState.DONE
-        yield StepMark(time_ns, "cycle/soak-30", 7, "soak", state, {"dwell_s": 1.5})
+        yield StepMark(time_ns, "cycle/soak-30", 7, "soak", state, {"soak_s": 1.5})
 
 
 async def test_the_step_under_way_is_shown_again_at_the_start(tmp_path):
@@ -76,7 +76,7 @@ async def test_the_step_under_way_is_shown_again_at_the_start(tmp_path):
     part, rest, event = trimmed(session, tmp_path / "part", begin_ns, begin_ns + 10 * NS_PER_S)
     started, done = session.steps()
     assert part.steps() == [
-        StepMark(begin_ns, started.step_id, 7, "soak", StepState.STARTED, {"dwell_s": 1.5}),
+        StepMark(begin_ns, started.step_id, 7, "soak", StepState.STARTED, {"soak_s": 1.5}),
         done,
     ]
     assert rest[1:] == within(telemetry(session), begin_ns, begin_ns + 10 * NS_PER_S)

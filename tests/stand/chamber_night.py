@@ -24,7 +24,7 @@ class Night:
     the chamber by running against the heat."""
 
     set_points_degC: Iterable[float]
-    dwell_s: float
+    soak_s: float
     laboratory_degC: float = 24.0
     disturb: Callable[["Night", float], None] = lambda night, time_s: None
     compressor_always: bool = False
@@ -57,7 +57,7 @@ class Night:
         end_ns = START_NS
         for set_point_degC in self.set_points_degC:
             self.send(f"062103{round(set_point_degC * 10) & 0xFFFF:04x}")
-            end_ns += seconds_ns(self.dwell_s)
+            end_ns += seconds_ns(self.soak_s)
             while (now_ns := self.clock.now_ns()) < end_ns:
                 self.disturb(self, (now_ns - START_NS) / NS_PER_S)
                 self.flap_open = float(end_ns - now_ns <= seconds_ns(OPEN_BEFORE_END_S))

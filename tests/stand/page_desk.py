@@ -149,7 +149,7 @@ class NightDesk(ADesk):
             text=text.format(SET_POINTS[index // 3]),
             standing=standing,
             duration_s=duration_s,
-            earned_s=max(0.0, min(duration_s, now_s - begin_s)) if kind == "soak" and begun else 0.0,
+            soaked_s=max(0.0, min(duration_s, now_s - begin_s)) if kind == "soak" and begun else 0.0,
             frames=5 if kind == "capture" else 0,
             frames_saved=5 if kind == "capture" and ended else 0,
             began_ns=self._at(begin_s) if begun else None,

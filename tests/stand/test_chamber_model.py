@@ -21,12 +21,12 @@ DWELL_S = 2400
 POLL_S = 15
 
 
-def followed(set_points_degC: tuple[float, ...], dwell_s: int) -> tuple[np.ndarray, np.ndarray]:
+def followed(set_points_degC: tuple[float, ...], soak_s: int) -> tuple[np.ndarray, np.ndarray]:
     """Air and camera each second, integrated: the truth, written down without the model's solution."""
     air, camera = [24.0], [44.0]
     for set_point_degC in set_points_degC:
         response = HEATING if set_point_degC > air[-1] else COOLING
-        for second in range(dwell_s):
+        for second in range(soak_s):
             wanted = (set_point_degC - air[-1]) / response.time_constant_s
             rate = max(-response.rate_K_per_s, min(response.rate_K_per_s, wanted))
             air.append(air[-1] + (rate if second >= response.dead_s else 0.0))

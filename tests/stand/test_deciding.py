@@ -39,8 +39,8 @@ CYCLE = ThermalCycle(
     equilibrium_s=100.0,
     set_points_degC=(30.0, 40.0, 50.0, 40.0, 30.0, 20.0, 10.0, 20.0),
     held_out_degC=(40.0,),
-    dwell_s=600.0,
-    until=Known(dwells_s=(60.0, 120.0)),
+    soak_s=600.0,
+    until=Known(soaks_s=(60.0, 120.0)),
 )
 PLAN = tuple(number_steps(thermal_cycle(CYCLE)))
 DECIDE = next(planned.step for planned in PLAN if isinstance(planned.step, Decide))
@@ -48,8 +48,8 @@ START_NS = 1_767_290_400 * NS_PER_S
 ENOUGH = {"kind": "enough", "reason": "known to 4 mpx"}
 
 
-def visit(chamber_degC: float, dwell_s: float) -> dict[str, object]:
-    return {"kind": "visit", "chamber_degC": chamber_degC, "dwell_s": dwell_s, "reason": "it teaches most"}
+def visit(chamber_degC: float, soak_s: float) -> dict[str, object]:
+    return {"kind": "visit", "chamber_degC": chamber_degC, "soak_s": soak_s, "reason": "it teaches most"}
 
 
 @pytest.fixture

@@ -61,9 +61,9 @@ def test_an_unknown_key_is_reported_with_the_one_that_may_be_meant_or_those_ther
 
 def test_keys_of_a_list_s_entries_are_known_too():
     with pytest.raises(
-        ConfigError, match=r"r\.yaml: experiments\.1\.thermal_cycle\.dwel_s: unknown.*did you mean dwell_s\?"
+        ConfigError, match=r"r\.yaml: experiments\.1\.thermal_cycle\.soa_s: unknown.*did you mean soak_s\?"
     ):
-        parse_document("name: r\nexperiments:\n  - thermal_cycle: {dwel_s: 3}\n", Recipe, "r.yaml")
+        parse_document("name: r\nexperiments:\n  - thermal_cycle: {soa_s: 3}\n", Recipe, "r.yaml")
 
 
 @pytest.mark.parametrize(

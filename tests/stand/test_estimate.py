@@ -93,15 +93,15 @@ def test_a_soak_says_when_the_chamber_arrives(config: StandConfig):
 
 
 @pytest.mark.parametrize(
-    ("dwell_s", "warning"),
+    ("soak_s", "warning"),
     [
         (300.0, "the dwell at 52 degC ends 2 min before the chamber arrives; the camera needs 30 min to follow"),
         (900.0, "the dwell at 52 degC ends 9 min after the chamber arrives; the camera needs 30 min to follow"),
         (2700.0, ""),
     ],
 )
-def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: StandConfig, dwell_s: float, warning: str):
-    soak = Soak(dwell_s / 2)
+def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: StandConfig, soak_s: float, warning: str):
+    soak = Soak(soak_s / 2)
     plan = planned(OpenFlap(), StartChamber(24.0), SetTemperature(52.0), soak, soak, CAPTURE, CAPTURE)
     warnings = [step.warning for step in price(plan, config, Learned(chamber=CHAMBER))]
     assert (*warnings[:3], *warnings[5:]) == ("", "", "", warning, "")

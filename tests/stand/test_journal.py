@@ -17,11 +17,11 @@ from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.journal_lines import journal_lines, lines_of
 from thermostand.stand.running.memory.entries import (
     Begun,
-    Dwell,
     Ended,
     Gap,
     Held,
     Reset,
+    Soaked,
     StepChanged,
     Tripped,
     decoded,
@@ -31,7 +31,7 @@ from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, take
 ENTRIES = [
     Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),
     StepChanged(2, "a1", "started"),
-    Dwell(3, "a1", 60.0),
+    Soaked(3, "a1", 60.0),
     Held(4, "operator", True),
     Held(5, "operator", False),
     Gap(5, 8),
@@ -46,7 +46,7 @@ words = st.text(max_size=20)
 entries = st.one_of(
     st.builds(Begun, times_ns, words, words, st.dictionaries(words, words, max_size=3), st.none() | st.integers(0)),
     st.builds(StepChanged, times_ns, words, st.sampled_from(["started", "done"])),
-    st.builds(Dwell, times_ns, words, st.floats(0, 1e6)),
+    st.builds(Soaked, times_ns, words, st.floats(0, 1e6)),
     st.builds(Held, times_ns, words, st.booleans()),
     st.builds(Gap, times_ns, times_ns),
     st.builds(Tripped, times_ns, words, words),

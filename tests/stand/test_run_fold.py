@@ -16,7 +16,6 @@ from thermostand.stand.running.memory.entries import (
     Begun,
     Cooled,
     Due,
-    Dwell,
     Edited,
     Ended,
     Extended,
@@ -26,6 +25,7 @@ from thermostand.stand.running.memory.entries import (
     Reset,
     Restored,
     Skipped,
+    Soaked,
     StepChanged,
     Taken,
     Tripped,
@@ -40,7 +40,7 @@ soak = {"kind": "soak", "parameters": {"duration_s": 5.0}}
 open_flap = {"kind": "open_flap", "parameters": {}}
 KINDS = {
     StepChanged: st.tuples(ids, st.sampled_from(["started", "done"])),
-    Dwell: st.tuples(ids, st.floats(0, 200)),
+    Soaked: st.tuples(ids, st.floats(0, 200)),
     Held: st.tuples(st.sampled_from(["operator", "interlock", "disk_low"]), st.booleans()),
     Again: st.tuples(st.lists(ids, max_size=3), st.integers(0, 2)),
     Skipped: st.tuples(ids),
@@ -121,8 +121,8 @@ def test_the_lines_of_a_journal_make_the_same_state(entries):
 @pytest.mark.parametrize(
     "entry",  # of wrong types, as a damaged or foreign line may hold
     [
-        Dwell(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
-        Dwell(0, [], 1.0),  # pyright: ignore[reportArgumentType]
+        Soaked(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
+        Soaked(0, [], 1.0),  # pyright: ignore[reportArgumentType]
         StepChanged(0, {}, "done"),  # pyright: ignore[reportArgumentType]
         Again(0, 7),  # pyright: ignore[reportArgumentType]
         Extended(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
@@ -146,8 +146,8 @@ def test_steps_that_are_none_are_refused(by):
 @pytest.mark.parametrize(
     ("entries", "is_unsettled"),
     [
-        ([Dwell(0, ID[3], 100.0, "settled"), StepChanged(0, ID[3], "done")], False),
-        ([Dwell(0, ID[3], 100.0, "unsettled"), StepChanged(0, ID[3], "done")], True),
+        ([Soaked(0, ID[3], 100.0, "settled"), StepChanged(0, ID[3], "done")], False),
+        ([Soaked(0, ID[3], 100.0, "unsettled"), StepChanged(0, ID[3], "done")], True),
         ([Skipped(0, ID[3])], True),
     ],
 )

@@ -49,7 +49,6 @@ from thermostand.stand.running.memory.entries import (
     Again,
     Cooled,
     Due,
-    Dwell,
     Edited,
     Ended,
     Entry,
@@ -60,6 +59,7 @@ from thermostand.stand.running.memory.entries import (
     Reset,
     Restored,
     Skipped,
+    Soaked,
     StepChanged,
     Taken,
     Tripped,
@@ -114,8 +114,8 @@ STATES = {
     "fresh": [],
     "begun": begun(START),
     "soak begun": begun(SOAK),
-    "half soaked": [*begun(SOAK), Dwell(0, SOAK, 50.0)],
-    "soaked": [*begun(SOAK), Dwell(0, SOAK, 100.0, "settled")],
+    "half soaked": [*begun(SOAK), Soaked(0, SOAK, 50.0)],
+    "soaked": [*begun(SOAK), Soaked(0, SOAK, 100.0, "settled")],
     "before opening": done(4),
     "opened": done(5),
     "capture begun": begun(CAPTURE),
@@ -412,7 +412,7 @@ def test_a_soak_longer_than_its_time_and_one_that_was_lost_owe_what_they_say():
     state = fold(PLAN, STATES["half soaked"])
     assert state.owed_ns(PLAN[3]) == 150 * S  # it may take twice its time
     assert after(state, StepChanged(0, SOAK, "done")).owed_ns(PLAN[3]) == 0
-    assert after(after(state, StepChanged(0, SOAK, "done")), Dwell(0, SOAK, 0.0)).owed_ns(PLAN[3]) == 200 * S
+    assert after(after(state, StepChanged(0, SOAK, "done")), Soaked(0, SOAK, 0.0)).owed_ns(PLAN[3]) == 200 * S
     settled = next(number_steps([SoakUntilSettled(900.0, 60.0, 240.0, 60.0, 0.2, 0.003, 0.1, 24.0)]))
     assert fold([settled], []).owed_ns(settled) == 900 * S
 

@@ -33,7 +33,7 @@ from thermostand.recording.format.journal_lines import lines_of
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from thermostand.stand.running.executing.actions import CREDITED_WITHIN_K
-from thermostand.stand.running.memory.entries import Again, Dwell, StepChanged, decoded
+from thermostand.stand.running.memory.entries import Again, Soaked, StepChanged, decoded
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.opening.stop import Interrupted
 
@@ -147,8 +147,8 @@ class RunMachine(RuleBasedStateMachine):
         """A soak that no interlock disturbs takes what it owes of the time during which nothing holds it."""
         life = self.life
         if mark.state is StepState.STARTED:
-            earned_s = [e.earned_s for e in self._entries() if isinstance(e, Dwell) and e.step_id == mark.step_id]
-            self.soak = life.open_s() + SOAKS_S[mark.step_id] - (earned_s[-1] if earned_s else 0.0), life.disturbances
+            soaked_s = [e.soaked_s for e in self._entries() if isinstance(e, Soaked) and e.step_id == mark.step_id]
+            self.soak = life.open_s() + SOAKS_S[mark.step_id] - (soaked_s[-1] if soaked_s else 0.0), life.disturbances
         if mark.state is StepState.DONE:
             end_s, disturbances = self.soak
             if disturbances == life.disturbances and abs(life.open_s() - end_s) > 1e-6:
@@ -266,16 +266,16 @@ class RunMachine(RuleBasedStateMachine):
 
     @invariant()
     def a_soak_earns_at_most_the_time_that_passes_and_all_of_its_duration(self):
-        earned_s, last_ns = defaultdict[str, float](float), dict[str, int]()
+        soaked_s, last_ns = defaultdict[str, float](float), dict[str, int]()
         for entry in self._entries() if self.life is not None else ():
-            if isinstance(entry, Dwell):
-                gained_s = entry.earned_s - earned_s[entry.step_id]
-                assert entry.earned_s == 0.0 or 0.0 <= gained_s <= 60.0 + 1e-6
+            if isinstance(entry, Soaked):
+                gained_s = entry.soaked_s - soaked_s[entry.step_id]
+                assert entry.soaked_s == 0.0 or 0.0 <= gained_s <= 60.0 + 1e-6
                 passed_s = (entry.time_ns - last_ns.get(entry.step_id, 0)) / NS_PER_S
-                assert entry.earned_s == 0.0 or gained_s <= passed_s + 1e-6
-                earned_s[entry.step_id], last_ns[entry.step_id] = entry.earned_s, entry.time_ns
+                assert entry.soaked_s == 0.0 or gained_s <= passed_s + 1e-6
+                soaked_s[entry.step_id], last_ns[entry.step_id] = entry.soaked_s, entry.time_ns
             if isinstance(entry, StepChanged) and entry.state == "done" and entry.step_id in SOAKS_S:
-                assert earned_s[entry.step_id] == SOAKS_S[entry.step_id]
+                assert soaked_s[entry.step_id] == SOAKS_S[entry.step_id]
 
     @invariant()
     def a_capture_that_is_done_has_its_frames(self):

@@ -68,7 +68,7 @@ def test_a_slip_is_found_by_the_schema():
 
 def test_a_recipe_that_waits_until_settled_fits():
     dwell = {"table_position": {}, "reference_degC": 24, "equilibrium_s": 2700, "set_points_degC": [24, 31]}
-    dwell |= {"held_out_degC": [], "dwell_s": 2700, "reference_frames": 1, "frames_per_point": 1}
+    dwell |= {"held_out_degC": [], "soak_s": 2700, "reference_frames": 1, "frames_per_point": 1}
     for until in ("settled", {"settled": {"min_s": 900}}):
         recipe = {"name": "settled", "experiments": [{"thermal_cycle": {**dwell, "until": until}}]}
         assert [fault.message for fault in validator("recipe").iter_errors(recipe)] == []

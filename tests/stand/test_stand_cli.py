@@ -68,8 +68,8 @@ def recipe_file(tmp_path: Path, **parameters: object) -> str:
         ({"table_position": {"vertical": 1}}, "this stand has no axis 'vertical'"),
         ({"table_position": {"linear": 290}}, "outside the limits (0.0, 280.0) of linear"),
         ({"interval_s": 0.2, "frames_per_point": 2}, "faster than cameras.camera.frame_rate_hz"),
-        ({"dwell_s": 604800, "cycles": 60}, "the plan takes 420 days"),
-        ({"dwel_s": 3}, "experiments.1.thermal_cycle.dwel_s: unknown key"),
+        ({"soak_s": 604800, "cycles": 60}, "the plan takes 420 days"),
+        ({"soa_s": 3}, "experiments.1.thermal_cycle.soa_s: unknown key"),
     ],
 )
 def test_a_plan_the_stand_may_not_do_is_refused_before_anything_moves(

@@ -76,7 +76,7 @@ def test_within_a_step_the_time_left_falls_with_the_clock_but_not_in_a_pause(con
 def test_what_an_earlier_part_of_the_run_has_done_is_not_waited_for(config: StandConfig):
     plan = planned(StartChamber(24.0), Soak(600.0), SetTemperature(24.5), Soak(300.0), Soak(60.0))
     steps = price(plan, config)
-    eta = Eta(steps, done={item.step_id for item in plan[:3]}, earned_s={plan[3].step_id: 120.0})
+    eta = Eta(steps, done={item.step_id for item in plan[:3]}, soaked_s={plan[3].step_id: 120.0})
     assert eta.left_s(BEGIN_NS) == 240.0
     again = marks(plan[3:], [180.0, 60.0])
     eta.mark(again[0])

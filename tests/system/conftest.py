@@ -59,7 +59,7 @@ experiments:
       equilibrium_s: 600
       set_points_degC: [30, 20, 24]
       held_out_degC: [20]
-      dwell_s: 600
+      soak_s: 600
       reference_frames: 2
       frames_per_point: 1
 """

@@ -18,7 +18,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.stand.chamber.compressor import CompressorState, keep
-from thermostand.stand.running.memory.entries import Begun, Dwell
+from thermostand.stand.running.memory.entries import Begun, Soaked
 from thermostand.stand.running.memory.journal import Journal
 from thermostand.stand.service.queue_file import changing
 
@@ -27,7 +27,7 @@ PAUSE_S = 0.005
 
 
 def journal_entry(index):
-    return Begun(0, "night-1", "0f", {}) if index == 0 else Dwell(index, f"soak-{index}", float(index))
+    return Begun(0, "night-1", "0f", {}) if index == 0 else Soaked(index, f"soak-{index}", float(index))
 
 
 def compressor_state(index):

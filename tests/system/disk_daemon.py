@@ -21,7 +21,7 @@ from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
-from thermostand.stand.running.memory.entries import Begun, Dwell, Ended
+from thermostand.stand.running.memory.entries import Begun, Ended, Soaked
 from thermostand.stand.running.memory.journal import Journal, Logbook
 from thermostand.stand.running.memory.state import RunState
 
@@ -42,7 +42,7 @@ async def publish(hub, clock, journal):
         hub.publish(Event(now_ns, "info", "note", str(number)))
         hub.publish(Frame("camera.image", IMAGE, now_ns, 0.1, 0.0, 40.0, number, number))
         if number % 5 == 0:
-            journal.note(Dwell(now_ns, "a1", float(number)))
+            journal.note(Soaked(now_ns, "a1", float(number)))
         number += 1
         await asyncio.sleep(0.02)
 

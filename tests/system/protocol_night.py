@@ -35,7 +35,7 @@ experiments:
   - thermal_cycle:
       equilibrium_s: 2700
       set_points_degC: [30, 36, 42, 47, 52, 47, 42, 36, 30, 24]
-      dwell_s: 2700
+      soak_s: 2700
       cycles: 2
 """
 GROWTH_LIMIT_MB = 5.0

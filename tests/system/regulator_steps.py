@@ -61,12 +61,12 @@ async def _steps(kind: Kind, chamber_seed: int | None, law: Law | None, channel:
         pulses = _count_pulses(stand)
         await stand.hold(FROM_degC, FROM_s)
         found: list[Step] = []
-        for set_point_degC, dwell_s in STEPS:
+        for set_point_degC, soak_s in STEPS:
             begin_s, pulses_before, events_before = stand.time_s, len(pulses), len(stand.events)
-            await stand.hold(set_point_degC, dwell_s)
+            await stand.hold(set_point_degC, soak_s)
             starts = [e for e in stand.events[events_before:] if e.kind == "compressor" and e.data["running"]]
             series = [(time_s - begin_s, degC) for time_s, degC in stand.series[channel] if time_s >= begin_s]
-            hours = dwell_s / 3600
+            hours = soak_s / 3600
             found.append(_step(set_point_degC, series, (len(pulses) - pulses_before) / hours, len(starts) / hours))
         assert stand.trips() == [], stand.trips()
         return found

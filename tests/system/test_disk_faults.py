@@ -40,7 +40,7 @@ from thermostand.stand.config.interface_section import TokenFile, load_tokens, w
 from thermostand.stand.config.stand_config import load_config, packaged
 from thermostand.stand.estimating.learned import Learned, load_learned
 from thermostand.stand.fault import Fault
-from thermostand.stand.running.memory.entries import Dwell, Ended, Held, StepChanged, Tripped
+from thermostand.stand.running.memory.entries import Ended, Held, Soaked, StepChanged, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
 from thermostand.stand.running.opening.claim import latch_file
 from thermostand.stand.running.order import load_order
@@ -78,7 +78,7 @@ def entries_of(index, time_ns, name, order):
     yield StepChanged(time_ns, step_id, "started")
     yield Held(time_ns, "disk", True)
     yield Held(time_ns, "disk", False)
-    yield Dwell(time_ns, step_id, float(index))
+    yield Soaked(time_ns, step_id, float(index))
     yield StepChanged(time_ns, step_id, "done")
     if name == TRIPPED and index == SECONDS - 1:
         yield Tripped(time_ns, "over_temperature", "too hot")

@@ -24,7 +24,7 @@ experiments:
       table_position: {linear: 2, rotary: 1}
       equilibrium_s: 300
       set_points_degC: [30, 24]
-      dwell_s: 300
+      soak_s: 300
       reference_frames: 1
       frames_per_point: 1
 """

@@ -39,7 +39,7 @@ experiments:
       table_position: {linear: 0, rotary: 0}
       set_points_degC: [31, 34, 38, 45, 48, 52, 48, 45, 38, 34, 31, 24, 20, 17, 10, 17, 20, 24]
       held_out_degC: [20, 34, 48]
-      dwell_s: 2700
+      soak_s: 2700
       reference_frames: 20
       frames_per_point: 5
 """

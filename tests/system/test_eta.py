@@ -76,7 +76,7 @@ def is_true(left: list[tuple[int, float]], session: Path, within_s: float) -> bo
 
 
 async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(SHORT_RECIPE.replace("dwell_s: 600", "dwell_s: 2700"))  # the first cooling takes more than 600 s
+    ordered = order(SHORT_RECIPE.replace("soak_s: 600", "soak_s: 2700"))  # the first cooling takes more than 600 s
     session, left = await followed(ordered, tmp_path)
     assert len(left) > 100
     assert worst_share(left, session) < 0.05
@@ -93,7 +93,7 @@ async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path,
 
 
 async def test_the_time_left_of_a_run_that_goes_on_is_true(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(SHORT_RECIPE.replace("dwell_s: 600", "dwell_s: 1500"))
+    ordered = order(SHORT_RECIPE.replace("soak_s: 600", "soak_s: 1500"))
     third = [planned.step_id for planned in ordered.recipe.plan() if isinstance(planned.step, Soak)][2]
 
     def stop(item: Item) -> None:
@@ -105,8 +105,8 @@ async def test_the_time_left_of_a_run_that_goes_on_is_true(tmp_path: Path, order
     (directory,) = (tmp_path / "out").iterdir()
     before = interruption(directory)
     steps = price(ordered.recipe.plan(), ordered.config)
-    done, earned_s = before.kept.done, before.kept.earned_s
-    watch, left = following(Eta(steps, done, earned_s))
+    done, soaked_s = before.kept.done, before.kept.soaked_s
+    watch, left = following(Eta(steps, done, soaked_s))
     await resume(before, watch)
     assert len(left) > 100
     assert is_true(left, directory, 5.0)
@@ -119,8 +119,8 @@ async def test_the_time_left_of_dwells_that_end_when_settled_is_true_once_a_run_
     recipe = SHORT_RECIPE.replace("[30, 20, 24]", "[28, 24]").replace("held_out_degC: [20]", "held_out_degC: []")
     # Looks are 2 min apart. A camera that is all but as slow as is asked for settles at this look or at the next, by
     # chance; at 0.0034 px/min all seeds do at the same one: those before and at it see 3.8 and at most 3.1 mpx/min.
-    settled = "dwell_s: 3600\n      until: {settled: {drift_px_per_min: 0.0034}}"
-    ordered = order(recipe.replace("dwell_s: 600", settled))
+    settled = "soak_s: 3600\n      until: {settled: {drift_px_per_min: 0.0034}}"
+    ordered = order(recipe.replace("soak_s: 600", settled))
     await followed(ordered, tmp_path, 3)
     learn(tmp_path, ordered.config)
     session, left = await followed(ordered, tmp_path, 4)

@@ -28,8 +28,8 @@ experiments:
       equilibrium_s: 900
       set_points_degC: [28, 34, 28, 20, 14, 20, 24]
       held_out_degC: [28]
-      dwell_s: 1200
-      until: {known: {residual_px: 0.001, dwells_s: [600, 900], wait_s: 3600}}
+      soak_s: 1200
+      until: {known: {residual_px: 0.001, soaks_s: [600, 900], wait_s: 3600}}
       reference_frames: 3
       frames_per_point: 1
 """

@@ -24,7 +24,7 @@ RECIPE = """
 name: up
 experiments:
   - thermal_cycle: {table_position: {linear: 0, rotary: 0}, reference_degC: 24, equilibrium_s: 3600,
-                    set_points_degC: [31, 38], dwell_s: 3600, reference_frames: 2, frames_per_point: 2}
+                    set_points_degC: [31, 38], soak_s: 3600, reference_frames: 2, frames_per_point: 2}
 """
 EFFECTS = ["sag", "dead_zone", "creep", "stick_slip", "unrepeated", "coarse_sensor", "far_air"]
 

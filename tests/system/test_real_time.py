@@ -34,7 +34,7 @@ experiments:
   - thermal_cycle:
       equilibrium_s: 0.5
       set_points_degC: [26]
-      dwell_s: 1.0
+      soak_s: 1.0
       reference_frames: 3
       interval_s: 0.5
 """

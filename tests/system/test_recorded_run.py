@@ -22,7 +22,7 @@ experiments:
       equilibrium_s: 60
       set_points_degC: [24]
       held_out_degC: []
-      dwell_s: 60
+      soak_s: 60
       reference_frames: 3
       frames_per_point: 2
 """

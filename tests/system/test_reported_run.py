@@ -31,7 +31,7 @@ experiments:
       equilibrium_s: 120
       set_points_degC: [30, 20, 26, 22]
       held_out_degC: [22]
-      dwell_s: 120
+      soak_s: 120
       band_K: 0
       reference_frames: 2
 """
@@ -47,7 +47,7 @@ EVERY_SEQUENCE = (
       temperatures_degC: [24, 30]
       positions: [{linear_mm: 20, rotary_deg: 0}, {linear_mm: 25, rotary_deg: 4}]
       equilibrium_s: 120
-      dwell_s: 120
+      soak_s: 120
       band_K: 0
       reference_frames: 1
       frames_per_position: 1
@@ -60,7 +60,7 @@ experiments:
       table_position: {linear: 0, rotary: 0}
       equilibrium_s: 60
       set_points_degC: [25]
-      dwell_s: 60
+      soak_s: 60
       band_K: 0
       reference_frames: 1
 """

@@ -25,7 +25,7 @@ from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.run_word import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session
-from thermostand.stand.running.memory.entries import Dwell, Gap, StepChanged
+from thermostand.stand.running.memory.entries import Gap, Soaked, StepChanged
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import Interruption, interruption
@@ -115,15 +115,15 @@ def check_soaks(directory: Path, order: Order) -> None:
     """Each soak was earned in slices of at most a minute without a break since it was last begun again."""
     entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
     durations_s = {p.step_id: getattr(p.step, "duration_s", 0.0) for p in order.recipe.plan()}
-    earned_s: dict[str, float] = {}
+    soaked_s: dict[str, float] = {}
     for entry in entries:
-        if isinstance(entry, Dwell):
-            gained_s = entry.earned_s - earned_s.get(entry.step_id, 0.0)
-            assert entry.earned_s == 0.0 or 0.0 <= gained_s <= 60.0 + 1e-9
-            earned_s[entry.step_id] = entry.earned_s
-        if isinstance(entry, StepChanged) and entry.state == "done" and entry.step_id in earned_s:
-            assert earned_s[entry.step_id] == durations_s[entry.step_id]
-    assert earned_s == {step_id: duration_s for step_id, duration_s in durations_s.items() if duration_s}
+        if isinstance(entry, Soaked):
+            gained_s = entry.soaked_s - soaked_s.get(entry.step_id, 0.0)
+            assert entry.soaked_s == 0.0 or 0.0 <= gained_s <= 60.0 + 1e-9
+            soaked_s[entry.step_id] = entry.soaked_s
+        if isinstance(entry, StepChanged) and entry.state == "done" and entry.step_id in soaked_s:
+            assert soaked_s[entry.step_id] == durations_s[entry.step_id]
+    assert soaked_s == {step_id: duration_s for step_id, duration_s in durations_s.items() if duration_s}
 
 
 def test_a_night_killed_at_three_random_moments_is_one_whole_session(tmp_path: Path, order: Callable[..., Order]):

@@ -232,7 +232,7 @@ async def test_a_compressor_that_dropped_by_itself_rests_before_it_starts_again(
 ):
     """The relay board is silent for longer than the compressor's timed-on relay holds, then answers again."""
     recipe = SHORT_RECIPE.replace("[30, 20, 24]", "[10]").replace("held_out_degC: [20]", "held_out_degC: []")
-    ordered = order(recipe.replace("dwell_s: 600", "dwell_s: 1500"), bus={"timeout_s": 0.1})
+    ordered = order(recipe.replace("soak_s: 600", "soak_s: 1500"), bus={"timeout_s": 0.1})
     states: list[tuple[int, float]] = []
     tasks: list[asyncio.Task[None]] = []
 

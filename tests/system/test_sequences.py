@@ -33,7 +33,7 @@ experiments:
       temperatures_degC: [24, 27]
       positions: [{linear_mm: 20, rotary_deg: 0}, {linear_mm: 25, rotary_deg: 4}]
       equilibrium_s: 120
-      dwell_s: 120
+      soak_s: 120
       reference_frames: 2
       frames_per_position: 1
       check_home_every: 1

@@ -13,7 +13,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import StepState
 from thermostand.foundation.progress import progress
 from thermostand.recording.reading.session import Session
-from thermostand.stand.running.memory.entries import Dwell
+from thermostand.stand.running.memory.entries import Soaked
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
@@ -24,14 +24,14 @@ experiments:
       table_position: {linear: 0, rotary: 0}
       equilibrium_s: 600
       set_points_degC: [28]
-      dwell_s: 3600
+      soak_s: 3600
       until: {settled: {drift_px_per_min: 0.004}}
       reference_frames: 2
       frames_per_point: 1
 """
 # A chamber that is never at its set-point, as far as these thresholds can tell, and a target that is not there.
 NEVER = RECIPE.replace("drift_px_per_min: 0.004", "drift_px_per_min: 0.0001").replace("[28]", "[26]")
-NEVER = NEVER.replace("dwell_s: 3600", "dwell_s: 900")
+NEVER = NEVER.replace("soak_s: 3600", "soak_s: 900")
 
 
 pytestmark = pytest.mark.usefixtures("compiled_fit")
@@ -48,10 +48,10 @@ async def test_a_dwell_ends_when_the_camera_has_settled_and_says_why(tmp_path: P
     soak_s = (end.time_ns - begin.time_ns) / NS_PER_S
     assert 900.0 < soak_s < 2700.0
     entries, _ = read_lines((session.path / "journal.jsonl").read_bytes())
-    dwells = [entry for entry in entries if isinstance(entry, Dwell) and entry.step_id == begin.step_id]
-    earned_s = [entry.earned_s for entry in dwells]
-    assert len(earned_s) >= soak_s / 70.0  # each 60 s, a look included
-    assert earned_s == sorted(earned_s)
+    dwells = [entry for entry in entries if isinstance(entry, Soaked) and entry.step_id == begin.step_id]
+    soaked_s = [entry.soaked_s for entry in dwells]
+    assert len(soaked_s) >= soak_s / 70.0  # each 60 s, a look included
+    assert soaked_s == sorted(soaked_s)
     assert [entry.ended for entry in dwells if entry.ended] == [dwells[-1].ended] == ["settled"]  # nothing is owed
     check_the_flap_opens_for_looks_only(session)
     check_looks_are_not_fitted(observe([session.path], progress))

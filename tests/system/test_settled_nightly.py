@@ -42,16 +42,16 @@ experiments:
       table_position: {{linear: 0, rotary: 0}}
       set_points_degC: {points}
       held_out_degC: {held_out}
-      dwell_s: {dwell_s}
+      soak_s: {soak_s}
       until: {until}
       reference_frames: 8
       frames_per_point: 2
 """
 BRISK = "{settled: {window_s: 480, camera_K_per_min: 0.4, drift_px_per_min: 0.006}}"
 FIXED, SETTLED, HURRIED = (
-    RECIPE.format(points=CYCLE, held_out="[]", dwell_s=2700, until=until) for until in ("null", "settled", BRISK)
+    RECIPE.format(points=CYCLE, held_out="[]", soak_s=2700, until=until) for until in ("null", "settled", BRISK)
 )
-THIRD = RECIPE.format(points=UNSEEN, held_out=UNSEEN, dwell_s=5400, until="null")
+THIRD = RECIPE.format(points=UNSEEN, held_out=UNSEEN, soak_s=5400, until="null")
 
 # Of the cycle's time. Measured: 0.28 and 0.42; steps of 3 and 4 K save more, steps of 14 K hardly anything.
 LEAST_SAVED = {"settled": 0.25, "hurried": 0.38}

@@ -297,7 +297,7 @@ async def test_each_combination_runs_and_records_what_it_lacks(combination: Comb
 CYCLE: Data = {
     "equilibrium_s": 120,
     "set_points_degC": [30, 20, 26],
-    "dwell_s": 120,
+    "soak_s": 120,
     "reference_frames": 1,
     "frames_per_point": 1,
 }

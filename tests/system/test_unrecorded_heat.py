@@ -167,7 +167,7 @@ async def test_a_run_whose_disk_process_is_killed_goes_on_with_another_until_it_
     assert "run.start" in [event.kind for event in Session.open(directory).events()]
     before = interruption(directory)
     before.release()
-    assert before.state.done or before.state.earned_s
+    assert before.state.done or before.state.soaked_s
     begun = [event.kind for event in Session.open(directory).events() if event.kind in ("run.start", "run.resume")]
     assert begun == ["run.start", *["run.resume"] * MOST_PER_H]
 

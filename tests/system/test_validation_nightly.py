@@ -33,7 +33,7 @@ experiments:
       table_position: {linear: 0, rotary: 0}
       set_points_degC: [31, 38, 45, 52, 45, 38, 31, 24, 17, 10, 17, 24]
       held_out_degC: [38]
-      dwell_s: 2700
+      soak_s: 2700
       reference_frames: 8
       frames_per_point: 3
 """

@@ -201,7 +201,7 @@ def _cycle(drawn: random.Random, stand: dict[str, str]) -> tuple[dict[str, list[
     if drawn.random() > CYCLES or stand["cameras"] != "1 camera":
         return None
     points, soak_s = drawn.sample(range(26, 46, 3), drawn.randint(3, 5)), drawn.choice((600, 1500))
-    cycle = {"set_points_degC": points, "dwell_s": soak_s, "equilibrium_s": soak_s, "reference_frames": 3}
+    cycle = {"set_points_degC": points, "soak_s": soak_s, "equilibrium_s": soak_s, "reference_frames": 3}
     cycle["frames_per_point"] = drawn.choice((1, 2))
     return {"experiments": [{"thermal_cycle": cycle}]}, 900.0 + (len(points) + 1) * (soak_s + 180.0)
 
@@ -211,14 +211,14 @@ def _plan(drawn: random.Random, stand: dict[str, str]) -> tuple[dict[str, list[A
     low = 12 if stand["relays"] != "no compressor" or stand["heat"] in CHAMBERS else 26
     has_table, has_camera = stand["axes"] == "two axes", stand["cameras"] != "no camera"
     if has_table and has_camera and drawn.random() < 0.25:
-        dwell_s = drawn.choice((300, 600, 900))
+        soak_s = drawn.choice((300, 600, 900))
         if drawn.random() < 0.5:
-            grid = {"linear_mm": [0, 40], "rotary_deg": [-5, 5], "frames_per_position": 1, "equilibrium_s": dwell_s}
-            return {"experiments": [{"calibration": grid}]}, 900.0 + dwell_s
+            grid = {"linear_mm": [0, 40], "rotary_deg": [-5, 5], "frames_per_position": 1, "equilibrium_s": soak_s}
+            return {"experiments": [{"calibration": grid}]}, 900.0 + soak_s
         spots = [{"linear_mm": 0, "rotary_deg": 0}, {"linear_mm": 40, "rotary_deg": 5}]
-        points = {"temperatures_degC": [24, drawn.randrange(low, 42) + 0.5], "positions": spots, "dwell_s": dwell_s}
-        points |= {"equilibrium_s": dwell_s, "reference_frames": 1, "frames_per_position": 1}
-        return {"experiments": [{"validation": points}]}, 1500.0 + 2 * dwell_s
+        points = {"temperatures_degC": [24, drawn.randrange(low, 42) + 0.5], "positions": spots, "soak_s": soak_s}
+        points |= {"equilibrium_s": soak_s, "reference_frames": 1, "frames_per_position": 1}
+        return {"experiments": [{"validation": points}]}, 1500.0 + 2 * soak_s
     soaks_s = drawn.choice(((120, 300, 600), (600, 1800, 3000)))  # a short plan finds most of what a long one does
     steps: list[Any] = ["close_flap", {"start_chamber": 26}, {"soak": soaks_s[0]}]
     duration_s = 150.0 + soaks_s[0]

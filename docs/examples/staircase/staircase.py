@@ -17,7 +17,7 @@ class Staircase(StillTable):
     reference_degC: Chamber_degC = 24.0
     stair_K: float = Field(default=6.0, gt=0, le=30)
     stairs: int = Field(default=4, ge=1, le=20)
-    dwell_s: Wait_s = 2700.0
+    soak_s: Wait_s = 2700.0
     frames: int = Field(default=5, ge=1, le=1000)
 
 
@@ -27,11 +27,11 @@ def staircase(parameters: Staircase) -> Iterator[Step]:
     yield CloseFlap()
     yield from placed(parameters.table_position)
     yield StartChamber(reference_degC)
-    yield Soak(parameters.dwell_s)
+    yield Soak(parameters.soak_s)
     yield from frames_through_flap(parameters, parameters.frames, Role.REFERENCE, reference_degC)
     for stair in range(1, parameters.stairs + 1):
         for chamber_degC in (reference_degC + stair * parameters.stair_K, reference_degC):
             yield SetTemperature(chamber_degC)
-            yield Soak(parameters.dwell_s)
+            yield Soak(parameters.soak_s)
             yield from frames_through_flap(parameters, parameters.frames, Role.FIT, chamber_degC)
     yield StopChamber()

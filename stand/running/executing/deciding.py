@@ -25,7 +25,7 @@ from thermostand.stand.running.memory.state import RunState
 
 _LINE = "design"
 Decides = Callable[[str, Mapping[str, Any]], Mapping[str, Any]]
-"""A session's folder and the parameters of the plan's step -> kind, reason and, of a visit, chamber_degC and dwell_s.
+"""A session's folder and the parameters of the plan's step -> kind, reason and, of a visit, chamber_degC and soak_s.
 A function of a module that can be a process, see foundation/helper.py."""
 
 
@@ -87,9 +87,9 @@ def _decided(found: Mapping[str, Any]) -> Decided:
     reason = str(found["reason"])
     match found["kind"]:
         case "visit":
-            visit = Visit(float(found["chamber_degC"]), float(found["dwell_s"]))
-            if not (math.isfinite(visit.chamber_degC) and 0 < visit.dwell_s < math.inf):
-                raise ValueError(f"a visit of {visit.chamber_degC} degC for {visit.dwell_s} s was decided")
+            visit = Visit(float(found["chamber_degC"]), float(found["soak_s"]))
+            if not (math.isfinite(visit.chamber_degC) and 0 < visit.soak_s < math.inf):
+                raise ValueError(f"a visit of {visit.chamber_degC} degC for {visit.soak_s} s was decided")
             return Decided(visit, reason)
         case "enough":
             return Decided(Enough(), reason)

@@ -68,11 +68,11 @@ from thermostand.stand.running.memory.entries import (
     Change,
     Cooled,
     Due,
-    Dwell,
     Extended,
     Readying,
     Restored,
     Skipped,
+    Soaked,
     StepChanged,
     Taken,
     data_of,
@@ -107,7 +107,7 @@ async def restore(
         await stand.gate.passed()
         worth, now_ns = worth_of_soaks(log.state, set_up, surroundings()), clock.now_ns()
         if worth.lost:
-            await log.write(*(Dwell(now_ns, soak.step_id, 0.0) for soak in worth.lost))
+            await log.write(*(Soaked(now_ns, soak.step_id, 0.0) for soak in worth.lost))
         if worth.text:
             log.tell(SOAK_RESTARTED if worth.lost else SOAK_CREDITED, worth.text)
         await stand.chamber.start(set_up.chamber_degC)

@@ -13,7 +13,7 @@ from thermostand.foundation.readings import UNSETTLED
 from thermostand.foundation.tasks import first_of
 from thermostand.stand.gate import Gate
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
-from thermostand.stand.running.memory.entries import Dwell
+from thermostand.stand.running.memory.entries import Soaked
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.memory.state import RunState, duration_of
 
@@ -75,11 +75,11 @@ class Soaking:
             is_settled = False
             text = f"{self._text(step)} at the end of the longest soak"
             if isinstance(step, Soak) and step.unsettled == "hold":
-                await self._log.write(Dwell(now_ns, step_id, 0.0))
+                await self._log.write(Soaked(now_ns, step_id, 0.0))
                 raise DeviceFault("regulator", f"{text}; once that is reset, the soak begins again")
             self._log.tell(SOAK_UNSETTLED, text, step_id=step_id)
         ended = "" if not is_over else "settled" if is_settled else "unsettled"
-        await self._log.write(Dwell(now_ns, step_id, earned_ns / NS_PER_S, ended))
+        await self._log.write(Soaked(now_ns, step_id, earned_ns / NS_PER_S, ended))
 
     @property
     def _state(self) -> RunState:

@@ -3,7 +3,7 @@ journal (recording/reading/journal_lines.py).
 
     Begun        the run, its plan and the texts it was made of; the first line and no other
     StepChanged  a step was started, or is done
-    Dwell        what a soak has earned so far
+    Soaked        what a soak has earned so far
     Held         a reason to wait appeared or went
     Gap          nothing ran between two instants
     Again        steps that were done are to be done again
@@ -63,13 +63,13 @@ class StepChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class Dwell:
-    """A soak has earned `earned_s`; also after its end, when it has to be earned again. ended: once it has, with the
+class Soaked:
+    """A soak has earned `soaked_s`; also after its end, when it has to be earned again. ended: once it has, with the
     chamber in its band or without."""
 
     time_ns: int
     step_id: str
-    earned_s: float
+    soaked_s: float
     ended: Literal["", "settled", "unsettled"] = ""
 
 
@@ -197,12 +197,12 @@ class Cooled:
     time_ns: int
 
 
-Written = Begun | StepChanged | Dwell | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Reset | Ended
+Written = Begun | StepChanged | Soaked | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Reset | Ended
 Entry = Written | Taken | Due | Readying | Restored | Cooled
 Change = Skipped | Extended | Edited  # of the plan
 
 _WRITTEN: dict[str, type[Written]] = {"Step": StepChanged} | {
-    kind.__name__: kind for kind in (Begun, Dwell, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Reset, Ended)
+    kind.__name__: kind for kind in (Begun, Soaked, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Reset, Ended)
 }
 _NAMES = {kind: name for name, kind in _WRITTEN.items()}
 

@@ -27,7 +27,6 @@ from thermostand.stand.running.memory.entries import (
     Change,
     Cooled,
     Due,
-    Dwell,
     Edited,
     Ended,
     Entry,
@@ -38,6 +37,7 @@ from thermostand.stand.running.memory.entries import (
     Reset,
     Restored,
     Skipped,
+    Soaked,
     StepChanged,
     Taken,
     Tripped,
@@ -57,11 +57,11 @@ def after(state: RunState, entry: Entry) -> RunState:
     match entry:
         case StepChanged():
             return _begun(state, entry) if entry.state == "started" else _done(state, entry)
-        case Dwell(_, step_id, earned_s, ended):
+        case Soaked(_, step_id, soaked_s, ended):
             if step_id in state.skipped:
                 return state
             soaked = {**_forget_ends(state, {step_id}), **({step_id: ended} if ended else {})}
-            earned_ns = _with(state.earned_ns, step_id, seconds_ns(earned_s))
+            earned_ns = _with(state.earned_ns, step_id, seconds_ns(soaked_s))
             return replace(state, earned_ns=earned_ns, soaked=MappingProxyType(soaked))
         case Taken():
             return _taken(state, entry)

@@ -182,7 +182,7 @@ class RunState:
         return self.disturbances > self.restored
 
     @property
-    def earned_s(self) -> dict[str, float]:
+    def soaked_s(self) -> dict[str, float]:
         """As earned_ns, in s."""
         return {step_id: earned_ns / NS_PER_S for step_id, earned_ns in self.earned_ns.items()}
 

@@ -175,7 +175,7 @@ export class Plan {
 
 const earned = (step) => {
   if (step.frames) return Math.min(1, step.frames_saved / step.frames);
-  return step.duration_s > 0 ? Math.min(1, step.earned_s / step.duration_s) : 0;
+  return step.duration_s > 0 ? Math.min(1, step.soaked_s / step.duration_s) : 0;
 };
 
 function bar(step) {
@@ -185,7 +185,7 @@ function bar(step) {
 function progress_text(step) {
   if (step.standing !== "under_way") return "";
   if (step.frames) return ` – ${step.frames_saved} of ${step.frames} frames`;
-  return step.earned_s > 0 ? ` – ${duration(step.earned_s)} of ${duration(step.duration_s)} earned` : "";
+  return step.soaked_s > 0 ? ` – ${duration(step.soaked_s)} of ${duration(step.duration_s)} soaked` : "";
 }
 
 // How far the end may be off, as the stand says; "" before there is anything to go by.
