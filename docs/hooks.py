@@ -129,7 +129,8 @@ def _paragraphs(text: str) -> str:
 def events() -> str:
     """The table of events, without the head of its page."""
     text = troubleshooting()
-    return text[text.index("| event |") :]
+    table = text[text.index("| event |") :]
+    return table.replace("{", "&#123;").replace("}", "&#125;")  # else the last ones of a cell are taken for attributes
 
 
 def stand_commands() -> str:
