@@ -44,7 +44,7 @@ async def take(folder: Path) -> None:
                     await page.get_by_role("button", name="Look at it and reset").click()
                     await page.wait_for_timeout(2000)
                     await page.screenshot(path=folder / "page-tripped.png")
-                desk.clear(Who(name="anna", how="loopback"))
+                desk.reset(Who(name="anna", how="loopback"))
                 lost = await pages.enter_async_context(a_page(chromium, port, "plan", PHONE, "dark"))
                 await lost.locator(".steps li", has_text="soak").first.wait_for()
             await lost.get_by_text("No connection to the stand").wait_for()
